@@ -126,8 +126,8 @@ void bind_callbacks(nb::module_ & module) {
 }
 
 // A field of the gate itself that is a word in Python.
-template <typename Value, typename Words>
-auto word_of(Value Gate::* field, const Words & words) {
+template <typename Value, typename Owner, typename Words>
+auto word_of(Value Owner::* field, const Words & words) {
   return std::pair(
       [field, &words](const GateDescription & described) {
         return std::string(words[static_cast<std::size_t>(described.gate.*field)]);
@@ -137,8 +137,8 @@ auto word_of(Value Gate::* field, const Words & words) {
       });
 }
 
-template <typename Value>
-auto value_in(Value Gate::* field) {
+template <typename Value, typename Owner>
+auto value_in(Value Owner::* field) {
   return std::pair(
       [field](const GateDescription & described) { return described.gate.*field; },
       [field](GateDescription & described, const Value & value) { described.gate.*field = value; });
@@ -160,18 +160,17 @@ void bind_gate(nb::module_ & module) {
         described.gate.slots.clear();
         for (const auto & [start, end] : pairs) described.gate.slots.push_back({start, end});
       });
-  property("cycle_ns", value_in(&Gate::cycle_ns));
-  property("anchor", word_of(&Gate::anchor, anchor_names));
-  property("phase_ns", value_in(&Gate::phase_ns));
-  property("overrun", word_of(&Gate::overrun, policy_names));
-  property("due_cycles", value_in(&Gate::due_cycles));
+  each_gate_value([&](const char * name, auto member, const auto &... words) {
+    if constexpr (sizeof...(words) == 0)
+      property(name, value_in(member));
+    else
+      property(name, word_of(member, words...));
+  });
   property("mode_names", value_in(&Gate::modes));
   property("bands", value_in(&Gate::bands));
   property("first_mode", value_in(&Gate::first_mode));
   property("late", word_of(&Gate::late, policy_names));
-  property("messages", word_of(&Gate::messages, messages_names));
   property("depth", value_in(&Gate::depth));
-  property("into_open_slot", word_of(&Gate::into_open_slot, entry_names));
   gate.def_rw("modes", &GateDescription::modes)
       .def_rw("moves", &GateDescription::moves)
       .def_rw("spin_ns", &GateDescription::spin_ns)

@@ -39,21 +39,14 @@ std::optional<std::size_t> place_of(const Words & words, const Word & word) {
   return static_cast<std::size_t>(found - words.begin());
 }
 
-// Modes are numbered in their order; `bands` has the place of each one's slot.
-struct Gate {
+// The publish slots of one output. Its numbers and words are declared in chainshaper/robot/gate.py.
+struct Gate : GateValues {
   std::vector<Slot> slots;
-  std::int64_t cycle_ns{0};
-  Anchor anchor{Anchor::stamp};
-  std::int64_t phase_ns{0};
-  Policy overrun{Policy::wait};
-  std::int64_t due_cycles{0};
-  std::vector<std::string> modes;
-  std::vector<std::size_t> bands;
-  std::size_t first_mode{0};
-  Policy late{Policy::wait};
-  Messages messages{Messages::all_in_order};
+  std::vector<std::string> modes;  // their names; modes are numbered in this order
+  std::vector<std::size_t> bands;  // the place of each mode's slot
+  std::size_t first_mode{0};       // in force until a mode is announced
+  Policy late{Policy::wait};       // for messages behind their mode's slot
   std::size_t depth{schema::depth};
-  Entry into_open_slot{Entry::at_once};
 
   bool may_move(std::int64_t by_ns) const {
     if (by_ns < -cycle_ns || by_ns > cycle_ns) return false;  // also what a sum could not hold

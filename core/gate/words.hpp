@@ -5,7 +5,10 @@
 #pragma once
 
 #include <array>
+#include <cstddef>
 #include <cstdint>
+#include <stdexcept>
+#include <string>
 
 namespace chainshaper {
 
@@ -25,6 +28,37 @@ inline constexpr std::array<const char *, 2> messages_names{
 enum class Dropped { replaced, overflowed, discarded };
 inline constexpr std::array<const char *, 3> dropped_names{
     "replaced", "overflowed", "discarded"};
+
+// The value that a word stands for. Throws std::invalid_argument for an unknown word.
+template <typename Value, typename Words>
+Value word_named(const Words & words, const std::string & name) {
+  for (std::size_t place = 0; place < words.size(); ++place)
+    if (words[place] == name) return static_cast<Value>(place);
+  throw std::invalid_argument("'" + name + "' is no word for a gate");
+}
+
+// The numbers and words of a gate, as `Gate` in Python declares them.
+struct GateValues {
+  std::int64_t cycle_ns{0};
+  Anchor anchor{Anchor::stamp};
+  std::int64_t phase_ns{0};
+  Policy overrun{Policy::wait};
+  std::int64_t due_cycles{0};
+  Messages messages{Messages::all_in_order};
+  Entry into_open_slot{Entry::at_once};
+};
+
+// Calls `visit` with the name and the member of each, and with the words that a word may be.
+template <typename Visit>
+void each_gate_value(Visit && visit) {
+  visit("cycle_ns", &GateValues::cycle_ns);
+  visit("anchor", &GateValues::anchor, anchor_names);
+  visit("phase_ns", &GateValues::phase_ns);
+  visit("overrun", &GateValues::overrun, policy_names);
+  visit("due_cycles", &GateValues::due_cycles);
+  visit("messages", &GateValues::messages, messages_names);
+  visit("into_open_slot", &GateValues::into_open_slot, entry_names);
+}
 
 namespace schema {
 

@@ -16,7 +16,7 @@ from passing import decided, held, serialized
 
 from chainshaper.robot import shaper as shaping
 from chainshaper.robot.decision import Release, missed, release_of
-from chainshaper.robot.gate import LATE, OVERRUNS, Gate, Modes
+from chainshaper.robot.gate import LATE, OVERRUNS, Gate, Modes, Overrun
 from chainshaper.robot.serialized import origin_of, text_of
 from chainshaper.robot.shaper import Shaper
 
@@ -37,7 +37,7 @@ MODAL_MS = Gate(
 )
 
 
-def with_late(late: str, overrun: str = "wait") -> Gate:
+def with_late(late: str, overrun: Overrun = "wait") -> Gate:
     return replace(MODAL, overrun=overrun, modes=replace(MODES, late=late))
 
 
@@ -193,11 +193,12 @@ def test_who_wakes_behind_the_slot_discards_what_came_in_time(
             pass
 
     monkeypatch.setattr(shaping, "sleep_until", oversleep)
-    for policy, treated in (
-        ("discard", ("discard", None, "discarded")),
-        ("wait", (None, 0, None)),
-        ("publish", (None, 0, None)),
-    ):
+    treatments: dict[Overrun, tuple[str | None, int | None, str | None]] = {
+        "discard": ("discard", None, "discarded"),
+        "wait": (None, 0, None),
+        "publish": (None, 0, None),
+    }
+    for policy, treated in treatments.items():
         shaper = Shaper(Gate(slots=(slot,), cycle_ns=100 * MS, overrun=policy))
         release = held(shaper, serialized(time.time_ns())).release
         assert (release.overrun, release.slot, release.dropped) == treated, policy
@@ -228,7 +229,7 @@ def test_who_wakes_behind_the_slot_discards_what_came_in_time(
     ],
 )
 def test_a_message_leaves_in_the_slot_of_its_mode_or_as_said(  # noqa: PLR0917 - a row of the table
-    late: str, overrun: str, arrival: int, leaves_at: int | None, slot: int | None, treated: str
+    late: str, overrun: Overrun, arrival: int, leaves_at: int | None, slot: int | None, treated: str
 ) -> None:
     release = release_of(with_late(late, overrun), arrival, 1000, changes=[(0, "village")])
     assert (release.at_ns, release.slot, release.overrun) == (leaves_at, slot, treated)
@@ -250,7 +251,7 @@ CHANGES = st.lists(st.tuples(LATER, st.sampled_from(sorted(MODES.bands)))).map(s
 
 @given(st.sampled_from(LATE), st.sampled_from(OVERRUNS), LATER, LATER, CHANGES)
 def test_a_cycle_has_one_mode_and_messages_leave_in_its_slot_unless_late(
-    late: str, overrun: str, arrival: int, other: int, changes: list[tuple[int, str]]
+    late: str, overrun: Overrun, arrival: int, other: int, changes: list[tuple[int, str]]
 ) -> None:
     release = release_of(with_late(late, overrun), arrival, 0, changes)
     band = MODES.bands[known(release.mode)]
@@ -357,7 +358,7 @@ def test_a_shaper_follows_the_modes_that_are_announced(monkeypatch: pytest.Monke
     moves=st.lists(st.tuples(st.integers(0, 2_000), st.integers(-60, 39)), max_size=5).map(sorted),
 )
 def test_moves_lose_double_and_reorder_no_message(
-    overrun: str, arrivals: list[int], ages: list[int], moves: list[tuple[int, int]]
+    overrun: Overrun, arrivals: list[int], ages: list[int], moves: list[tuple[int, int]]
 ) -> None:
     gate = Gate(slots=((60, 61),), cycle_ns=100, overrun=overrun, depth=12)
     stamped = tuple((at, at - age) for at, age in zip(arrivals, ages, strict=False))

@@ -37,8 +37,8 @@ def test_the_publisher_is_remapped_and_the_shaping_node_takes_its_place(
     assert (callback.subscription, callback.publishes) == ("/t3_tmp", ("/t3",))
     assert (shaping.core, shaping.priority) == (EXECUTOR_CORE, 84)
     gate = known(callback.gate)
-    assert (gate.slots, gate.cycle_ns) == (publish_slots(plan), 50_000_000)
-    assert (gate.anchor, gate.spin_ns, gate.pause_ns) == ("stamp", 1_000_000, 2_000_000)
+    assert (gate.slots, gate.gate().cycle_ns) == (publish_slots(plan), 50_000_000)
+    assert (gate.gate().anchor, gate.spin_ns, gate.pause_ns) == ("stamp", 1_000_000, 2_000_000)
     asynchronous = TopicDescription(publication="asynchronous")
     assert spliced.topic("/t3_tmp") == spliced.topic("/t3") == asynchronous
     for name in ("first", "second", "actuator"):
@@ -47,7 +47,7 @@ def test_the_publisher_is_remapped_and_the_shaping_node_takes_its_place(
     assert Application.model_validate(spliced.model_dump()) == spliced
     for overrun in ("wait", "discard", "publish"):
         treated = splice_application(application, Plan.of(revised(plan, overrun=overrun)))
-        assert known(treated.nodes["chainshaper_t3"].callbacks[0].gate).overrun == overrun
+        assert known(treated.nodes["chainshaper_t3"].callbacks[0].gate).gate().overrun == overrun
 
 
 def _changed(plan: ChainPlan, **changes: object) -> ChainPlan:
@@ -135,7 +135,7 @@ def test_every_topic_of_let_per_callback_gets_a_gate_of_its_own(
         for _, callback in spliced.callbacks()
         if callback.gate is not None
     }
-    due = {topic: (gate.due_cycles, gate.slots) for topic, gate in gates.items()}
+    due = {topic: (gate.gate().due_cycles, gate.slots) for topic, gate in gates.items()}
     ms = 1_000_000
     assert due == {
         "/t1": (1, ((2 * ms, 3 * ms),)),

@@ -29,7 +29,7 @@ from small_chain import EXECUTOR_CORE
 from chainshaper.planning import ChainPlan
 from chainshaper.planning.chain_plan import ShapingNode, revised
 from chainshaper.robot import decision
-from chainshaper.robot.node_parameters import NodeParameters, gate_parameters
+from chainshaper.robot.node_parameters import PARAMETERS, gate_parameters, parameters_from
 from chainshaper.robot.shaper import READER_DEPTH
 from chainshaper.sources.gate_log import read_gate_log
 from chainshaper.splicing.gate_settings import gate_of
@@ -135,7 +135,7 @@ def test_a_core_is_cleared_for_delivering_threads_that_have_names(
 def test_every_parameter_is_documented() -> None:
     text = (Path(__file__).parents[2] / "docs" / "shaping_node.md").read_text()
     throttled = {"inputs", "outputs", "period_ns"}
-    assert [name for name in vars(NodeParameters()) if f"`{name}`" not in text] == sorted(throttled)
+    assert [name for name in PARAMETERS if f"`{name}`" not in text] == sorted(throttled)
 
 
 def test_a_gate_with_modes_is_the_same_behind_its_parameters(
@@ -143,7 +143,7 @@ def test_a_gate_with_modes_is_the_same_behind_its_parameters(
 ) -> None:
     gate = gate_of(banded(plan), node)
     parameters = gate_parameters(gate, "/mode")
-    assert NodeParameters(**parameters).gate() == gate
+    assert parameters_from(parameters).gate() == gate
     assert parameters["slots_ns"] == [bound for slot in SLOTS for bound in slot]
     modes = {key: value for key, value in parameters.items() if key.startswith("mode")}
     names = {"mode_names": ["city", "highway"], "mode_slots": [1, 0]}  # the places of their slots

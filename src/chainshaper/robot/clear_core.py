@@ -1,10 +1,10 @@
 """A core that is clear of other work while an output is delivered there.
 
-DDS threads that receive outrank everything else on their core, but unless the kernel is fully
-preemptible, an ordinary thread that is inside a system call ends that first, and a core that idles
-has to wake up. So a thread of the lowest real-time priority watches the clock there around a
-release: ordinary threads do not run meanwhile, and receiving ones preempt it within microseconds.
-It is a process of its own, since within one of Python it would hold up the gate.
+The DDS threads that receive outrank everything else on their core. But unless the kernel is fully
+preemptible, an ordinary thread inside a system call completes that call first, and an idle core has
+to wake up. So around a release a thread of the lowest real-time priority watches the clock on that
+core: ordinary threads do not run meanwhile, and receiving threads preempt it within microseconds.
+It is a process of its own, because a thread of the gate's Python process would delay the gate.
 """
 
 import inspect
@@ -19,9 +19,10 @@ from typing import Any
 def started_beside(
     function: Callable[..., None], *arguments: Any
 ) -> tuple["subprocess.Popen[bytes]", int]:
-    """A process that has this function only, and a pipe to its standard input.
+    """Start a process that runs this function only; return it with a pipe to its standard input.
 
-    It imports what it needs itself. It hears no Ctrl-C, and ends with who has the pipe.
+    The function imports what it needs itself. The process gets no Ctrl-C from the terminal, and
+    ends when its standard input does.
     """
     program = f"{inspect.getsource(function)}\n{function.__name__}{arguments!r}"
     reading, writing = os.pipe()
@@ -36,7 +37,7 @@ def started_beside(
 
 
 def _clear(core: int) -> None:
-    """Clear a core until the times (ns of CLOCK_MONOTONIC) that come on standard input."""
+    """Keep a core clear until the times that come on standard input (ns of CLOCK_MONOTONIC)."""
     import os
     import time
 
@@ -49,14 +50,14 @@ def _clear(core: int) -> None:
 
 
 class ClearCore:
-    """A process that clears a core; none where SCHED_FIFO or the core is refused."""
+    """A process that keeps a core clear; it ends where SCHED_FIFO or the core is refused."""
 
     def __init__(self, core: int) -> None:
         self._process, self._times = started_beside(_clear, core)
         self.pid = self._process.pid
 
     def clear_until(self, time_ns: int) -> None:
-        """Clear the core from now until then."""
+        """Keep the core clear from now until this time (ns of CLOCK_MONOTONIC)."""
         with suppress(BrokenPipeError):
             os.write(self._times, time_ns.to_bytes(8, "little"))
 

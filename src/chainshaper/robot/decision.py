@@ -16,24 +16,35 @@ DROPPED = get_args(Dropped)
 
 @dataclass(slots=True)  # making a frozen one takes a microsecond more, on the way of every message
 class Release:
-    """The gate's decision for one message; times are ns of CLOCK_MONOTONIC."""
+    """The gate's decision for one message. Times are ns of CLOCK_MONOTONIC.
 
-    at_ns: int | None  # when it may leave (not after the arrival: at once; None: it is dropped)
+    * ``at_ns``: when the message may leave; not after its arrival: at once; None: it is dropped.
+    * ``origin_ns``: when the message's own cycle starts.
+    * ``slot``: the place of the slot that it leaves in, from 0; None: it leaves in no slot.
+    * ``cycles_waited``: cycles from its own to the one it leaves in.
+    * ``anchor``: what its slots were counted from.
+    * ``overrun``: the policy that was applied to it; None: it came in time.
+    * ``mode``: the mode of its cycle; None: there are no modes.
+    * ``moved_ns``: by how much the slots of the cycle in which it leaves are moved.
+    * ``dropped``: the reason why it never leaves; None: it leaves.
+    """
+
+    at_ns: int | None
     origin_ns: int
-    slot: int | None  # in which one that is, if in any
-    cycles_waited: int  # after its own
-    anchor: str  # what the slots were counted from
-    overrun: str | None = None  # the policy that was applied to it; None: it came in time
-    mode: str | None = None  # of its cycle; None: there are no modes
-    moved_ns: int = 0  # by so much the slots of the cycle in which it leaves
-    dropped: str | None = None  # for that reason
+    slot: int | None
+    cycles_waited: int
+    anchor: str
+    overrun: str | None = None
+    mode: str | None = None
+    moved_ns: int = 0
+    dropped: str | None = None
 
     def start_ns(self, cycle_ns: int) -> int:
-        """When the cycle starts in which the message leaves."""
+        """Return when the cycle starts in which the message leaves."""
         return self.origin_ns + self.cycles_waited * cycle_ns
 
     def dropping(self, reason: Dropped) -> "Release":
-        """The decision to drop the message instead."""
+        """Return the decision to drop the message instead."""
         return replace(self, at_ns=None, slot=None, dropped=reason)
 
 
@@ -47,12 +58,16 @@ def release_of(
     phase_ns: int | None = None,
     moves: Sequence[tuple[int, int]] = (),
 ) -> Release:
-    """Decide when a message may leave; times are ns of CLOCK_MONOTONIC.
+    """Decide when a message may leave. Times are ns of CLOCK_MONOTONIC.
 
-    ``stamp_ns`` is its origin, if it has one; ``changes`` are the modes that were announced, each
-    with the time, ascending. It leaves at ``ready_ns`` at the earliest, where others are before it.
-    ``phase_ns`` stands for the gate's own. ``moves`` are from when on slots are moved, ascending,
-    and by how much from where the gate has them.
+    * ``stamp_ns``: the message's origin; None: it has none.
+    * ``changes``: the modes that were announced, each behind the time of its announcement;
+      ascending.
+    * ``ready_ns``: the message leaves at this time at the earliest, because others leave before it;
+      None: at its arrival.
+    * ``phase_ns``: where cycles start; None: at the gate's ``phase_ns``.
+    * ``moves``: by how much slots are moved from where the gate has them, each behind the time from
+      which on; ascending.
 
         >>> gate = Gate(slots=((60, 61),), cycle_ns=100)
         >>> release_of(gate, arrival_ns=1040, stamp_ns=1000).at_ns      # early: it waits
@@ -98,12 +113,12 @@ def release_of(
 
 
 def moved_at(moves: Sequence[tuple[int, int]], cycle_start_ns: int) -> int:
-    """By how much the slots of a cycle that begins then are moved (ns)."""
+    """Return by how much the slots of the cycle that starts at this time are moved (ns)."""
     return next((by for since, by in reversed(moves) if since <= cycle_start_ns), 0)
 
 
 def missed(gate: Gate, release: Release, now_ns: int) -> bool:
-    """Whether the slot that a message was to leave in is over (ns of CLOCK_MONOTONIC)."""
+    """Return whether the slot that the message was to leave in is over."""
     if release.slot is None:
         return False
     cycle_start = release.start_ns(gate.cycle_ns) + release.moved_ns

@@ -23,8 +23,8 @@ single files that :mod:`chainshaper.splicing` puts together from them.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal, TypeAlias, get_args
+from dataclasses import dataclass, fields
+from typing import Annotated, Literal, NamedTuple, TypeAlias, get_args, get_origin
 
 Anchor: TypeAlias = Literal["stamp", "cycle"]
 Overrun: TypeAlias = Literal["wait", "discard", "publish"]
@@ -46,10 +46,12 @@ def _one_of(key: str, word: str, known: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class Modes:
-    """Which of the gate's ``slots`` (by its place, from 0) the messages of each mode leave in.
+    """The slot that the messages of each mode of the system leave in.
 
-    ``default`` is in force until a mode is announced. ``late``: of messages that come behind their
-    mode's slot; with ``next-slot`` one behind the last slot is still an overrun.
+    * ``bands``: the place of each mode's slot in the gate's ``slots``, from 0.
+    * ``default``: the mode in force until one is announced.
+    * ``late``: what happens to a message behind its mode's slot; with ``next-slot`` one that comes
+      behind the last slot is still an overrun.
     """
 
     bands: Mapping[str, int]
@@ -63,36 +65,55 @@ class Modes:
         _one_of("late", self.late, LATE)
 
 
+class AtLeast(NamedTuple):
+    """The smallest value of a number."""
+
+    number: int
+
+
 @dataclass(frozen=True)
 class Gate:
-    """The publish slots of one output. All times are nanoseconds.
+    """The publish slots of one output, and what happens to its messages.
 
-    ``slots`` are half-open ``(start, end)`` intervals counted from the anchor, ascending, apart
-    from each other and inside ``[0, cycle_ns)``. With the ``stamp`` anchor, ``phase_ns`` serves
-    messages whose stamp is of no use: it is older than :data:`MAX_AGE_CYCLES`, or from the future.
+    This is the one declaration of a gate's fields. Names in ``_ns`` are times in nanoseconds. From
+    its numbers and words derive the ROS parameters (:mod:`chainshaper.robot.node_parameters`), the
+    values in C++ (`scripts/gate-words`), the description in YAML
+    (:class:`chainshaper.workload.description.GateDescription`) and what the simulator gets.
 
-    A message is due in the cycle that it belongs to, or, under logical execution time,
-    ``due_cycles`` later, and leaves in none before. With the ``cycle`` anchor it belongs to the
-    cycle it arrives in, and is due in the next one at the latest: the data of each callback came a
-    cycle before. Raises ValueError: such a gate makes no sense.
+    * ``slots``: half-open ``(start, end)`` intervals in ns, counted from the start of the cycle;
+      ascending, apart from each other, inside ``[0, cycle_ns)``.
+    * ``cycle_ns``: the time from the start of one cycle to the next.
+    * ``anchor``: where a cycle starts: at the stamp of the message, or where the servers start it.
+    * ``phase_ns``: an instant at which a cycle starts, for the anchor ``cycle``, and for a stamp
+      that is of no use: older than :data:`MAX_AGE_CYCLES`, or from the future.
+    * ``overrun``: what happens to a message behind the last slot that it was due in.
+    * ``due_cycles``: cycles from the one that a message belongs to until the one that it is due in
+      (logical execution time); it leaves in none before. With the anchor ``cycle`` a message
+      belongs to the cycle it arrives in, and is due in the next one at the latest: the data of each
+      callback came a cycle before.
+    * ``modes``: which slots the messages of each mode leave in; None: there are no modes.
+    * ``messages``: which of several messages in one cycle leave.
+    * ``depth``: how many messages may wait.
+    * ``into_open_slot``: when a message leaves that arrives in an open slot.
+
+    Raises ValueError: such a gate makes no sense.
     """
 
     slots: tuple[tuple[int, int], ...]
-    cycle_ns: int
-    anchor: str = "stamp"
+    cycle_ns: Annotated[int, AtLeast(1)]
+    anchor: Anchor = "stamp"
     phase_ns: int = 0
-    overrun: str = "wait"
-    due_cycles: int = 0
+    overrun: Overrun = "wait"
+    due_cycles: Annotated[int, AtLeast(0)] = 0
     modes: Modes | None = None
-    messages: str = "all-in-order"
-    depth: int = DEPTH
-    into_open_slot: str = "at-once"
+    messages: Messages = "all-in-order"
+    depth: Annotated[int, AtLeast(1)] = DEPTH
+    into_open_slot: IntoOpenSlot = "at-once"
 
     def __post_init__(self) -> None:
-        _one_of("anchor", self.anchor, ANCHORS)
-        _one_of("overrun", self.overrun, OVERRUNS)
-        _one_of("messages", self.messages, MESSAGES)
-        _one_of("into_open_slot", self.into_open_slot, INTO_OPEN_SLOT)
+        for declared in fields(self):
+            if get_origin(declared.type) is Literal:
+                _one_of(declared.name, getattr(self, declared.name), get_args(declared.type))
         if self.depth < 1:
             raise ValueError(f"room for {self.depth} messages: a gate needs it for one at least")
         if self.due_cycles < 0:
@@ -113,24 +134,38 @@ class Gate:
                 raise ValueError(f"mode {mode!r}: band {band}, but {known}")
 
     def may_move(self, by_ns: int) -> bool:
-        """Whether slots that are moved by so much lie within the cycle still."""
+        """Return whether slots that are moved by this time still lie within the cycle."""
         return self.slots[0][0] + by_ns >= 0 and self.slots[-1][1] + by_ns <= self.cycle_ns
 
     @property
     def policy(self) -> str:
-        """What becomes of a message that comes behind the last slot that is open to it."""
+        """What happens to a message that comes behind the last slot that is open to it."""
         if self.modes is None or self.modes.late == "next-slot":
             return self.overrun
         return self.modes.late
 
     def lets_out(self, slot: tuple[int, int], from_ns: int, arrival_ns: int, ready_ns: int) -> bool:
-        """Whether a message may leave in a slot of the cycle that begins then, or before it."""
+        """Return whether a message may leave in a slot, or wait for it.
+
+        ``from_ns`` is the start of the slot's cycle; the message is ready at ``ready_ns``.
+        """
         in_time = self.into_open_slot == "at-once" or arrival_ns <= from_ns + slot[0]
         return in_time and ready_ns < from_ns + slot[1]
 
     def counts_from(self, stamp_ns: int | None, arrival_ns: int) -> bool:
-        """Whether a message's slots count from its stamp."""
+        """Return whether a message's slots count from its stamp."""
         if stamp_ns is None or self.anchor != "stamp":
             return False
         max_age = (MAX_AGE_CYCLES + self.due_cycles) * self.cycle_ns
         return -MAX_FUTURE_NS <= arrival_ns - stamp_ns <= max_age
+
+
+VALUES = tuple(
+    declared for declared in fields(Gate) if declared.name not in ("slots", "modes", "depth")
+)
+"""The declarations of a gate's values that are one number or one word."""
+
+
+def values_of(gate: Gate) -> dict[str, int | str]:
+    """Return a gate's values that are one number or one word, by their names."""
+    return {declared.name: getattr(gate, declared.name) for declared in VALUES}

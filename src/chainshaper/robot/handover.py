@@ -1,22 +1,24 @@
 """Which process publishes a shaped output: the shaping node, or the standby beside it.
 
-The standby receives the same messages as the shaping node, and passes them on while that is not
-in force. For each one of the two is responsible, whenever either is killed, stopped or started:
+The standby receives the same messages as the shaping node, and publishes them while no shaping node
+is in force. For each message one of the two is responsible, whenever either is killed, stopped or
+started:
 
-* The **lock** of a file says whether a shaping node is in force; the kernel frees it at the node's
-  death. The node takes it with the first message that it receives, when its output is ready; the
-  standby takes it for as long as it publishes.
-* The file itself is a **page** in memory that both map: which messages each of them has dealt with
-  (by their source timestamps), and until when the node may take for the one that it holds.
+* The **lock** of a file says whether a shaping node is in force; the kernel frees it when the node
+  dies. The node takes it with the first message that it receives, when its output is ready; the
+  standby takes it while it publishes.
+* The file itself is a **page** that both read and write: which messages each of them has dealt with
+  (by their source timestamps), and until when the node may hold the message that it has.
 
-What the node has received and not released when it dies, or hangs longer than a given patience, the
-standby publishes; what the standby has published, the node leaves out. What is left are the
-microseconds from a publication until it is noted, in which a death has it published again.
+The standby publishes what the node had received and not released when it died, or when it hung for
+longer than a given patience. The node leaves out what the standby has published. A node that dies
+in the microseconds between a publication and its note on the page has it published twice.
 
-Who has slots follow the latencies reads these in a third ring, and says there by how much slots are
-moved, for as long as it has a lock of its own: however it ends, they go back.
+`apply --adapt` reads latencies from a third ring of the page, and writes there by how much slots
+are moved. It has a lock of its own while it does; when that lock is free, however the process
+ended, the gate uses the planned slots.
 
-Standard library only, as the gate; `handover.hpp`, the node's side in C++, has this layout.
+Standard library only, as the gate. `handover.hpp`, the node's side in C++, has this layout.
 """
 
 import fcntl
@@ -36,61 +38,61 @@ from chainshaper.robot.shaper import Shaper
 from chainshaper.robot.waiting import Outcome, Waiting
 
 FIELDS = (
-    "holder",  # the shaping node in force, a process id; 0 while the standby has the lock
+    "holder",  # the process id of the shaping node in force; 0 while the standby has the lock
     "taken",  # how many messages shaping nodes have begun with
     "first",  # the first message of the shaping node in force
     "acknowledged",  # the same, once the standby has passed on all that came before it
-    "until_ns",  # what the node has in hand is released then; CLOCK_MONOTONIC, as all times here
+    "until_ns",  # when the node releases the message it has; CLOCK_MONOTONIC, as all times here
     "released",  # how many messages shaping nodes have dealt with: so many are in their ring
-    "phase_ns",  # where cycles begin; a node that its launch starts again goes on from there
-    "phase_known",
+    "phase_ns",  # where cycles start; a node that its launch starts again goes on from there
+    "phase_known",  # 1: the number before is one
     "mode",  # the mode in force, from 1 in their order; 0: there are no modes
     "started_ns",  # when a shaping node started last
-    "failed_starts",  # how many did, shortly one after the other, and dealt with no message
-    "starts",  # of shaping nodes of this launch
-    "standby",  # the standby, a process id
-    "listening",  # 1: it has received a message, and so receives all that come behind it
-    "silent",  # 1: the standby passes nothing on, it counts what is lost
-    "bypassing_since_ns",  # 0: a shaping node is in force
+    "failed_starts",  # starts in quick succession after which the node dealt with no message
+    "starts",  # starts of shaping nodes in this launch
+    "standby",  # the process id of the standby
+    "listening",  # 1: the standby has received a message, and so receives all later ones
+    "silent",  # 1: the standby publishes nothing, it counts what is lost
+    "bypassing_since_ns",  # since when no shaping node is in force; 0: one is
     "bypassed",  # how many messages the standby has dealt with: so many are in its ring
-    "bypassed_before",  # how many of these before the present time without a shaping node
+    "bypassed_before",  # how many of these it had before the present time without a shaping node
     "published",  # how many messages shaping nodes of this launch have published
     *DROPPED,  # how many they have dropped, for each of the gate's reasons
-    "lost_by_dds",  # how many are missing in what they have received
-    "late",  # how many came behind the last slot that they were due in
+    "lost_by_dds",  # messages that DDS lost before they reached shaping nodes
+    "late",  # messages that came behind the last slot that they were due in
     "measured",  # how many latencies, from origin to arrival, are in their ring
-    "moved_ns",  # by how much slots are moved from where the gate has them,
-    "moved_from_ns",  # for cycles that begin then or later; 0: it is being written, or never was
-    "in_process",  # 1: the gate is in the publisher's process, which needs no standby,
-    "asked_phase_ns",  # and no ROS parameter: where its cycles are asked to begin,
-    "phases_asked",  # so often so far
+    "moved_ns",  # by how much slots are moved from where the gate has them
+    "moved_from_ns",  # in cycles that start then or later; 0: it is being written, or never was
+    "in_process",  # 1: the gate is in the publisher's process, and needs no standby
+    "asked_phase_ns",  # where cycles of that gate are asked to start: it has no ROS parameters
+    "phases_asked",  # how often that was asked so far
     "parent",  # of the shaping node that started last: the process that launched it
 )
 """Numbers of 8 bytes at the beginning of a page, in this order."""
 
 VERSION = 4  # of the page's layout: part of its name
 RING = 1024
-RELEASED, BYPASSED, MEASURED = 32, 32 + RING, 32 + 2 * RING  # places of three rings,
-TOPIC = 32 + 3 * RING  # and of the name
+RELEASED, BYPASSED, MEASURED = 32, 32 + RING, 32 + 2 * RING  # places of three rings
+TOPIC = 32 + 3 * RING  # place of the output's name
 TOPIC_BYTES = 256
 PUBLISHING, STANDING_BY, PASSING, MOVING = 0, 1, 2, 3
-"""The bytes of the file that are locked, for the rights to publish, to be the standby, to publish
-as the standby although the shaping node has the first, and to move slots."""
+"""The bytes of the file that are locked. Each stands for a right: to publish; to be the standby; to
+publish as the standby although the shaping node has the first; to move slots."""
 _RINGS = {"released": RELEASED, "bypassed": BYPASSED, "measured": MEASURED}
-"""Each has the name under which the numbers in it are counted."""
+"""The place of each ring, by the name of the field that counts its numbers."""
 _COUNTS = ("starts", "published", *DROPPED, "lost_by_dds", "late")
-"""These begin at 0 with each launch: what a node did for another one is not this one's."""
+"""These start at 0 with each launch."""
 _AT = {name: place for place, name in enumerate(FIELDS)}
 _SIZE = 8 * TOPIC + TOPIC_BYTES
 _FLOCK = "hhqqi4x"  # struct flock: type, whence, start, length, process
 
-GIVE_UP_NS = 50_000_000  # a node waits so long for a standby, which needs the lock a moment only
-AT_ONCE_NS = 30_000_000_000  # a node that deals with no message for so long has not failed at once
-BACK_OFF_AFTER = 3  # so many starts may fail at once; each further one waits twice as long
+GIVE_UP_NS = 50_000_000  # how long a node waits for a standby, which needs the lock a moment only
+AT_ONCE_NS = 30_000_000_000  # a node that ran for longer has not failed at once
+BACK_OFF_AFTER = 3  # starts that may fail at once; each further one waits twice as long
 
 
 def page_folders() -> Iterator[str]:
-    """Where pages are, in memory, the best first: of root, of a login session, of any user."""
+    """Yield the folders in memory that pages may be in: root's, a login session's, any user's."""
     user, session = os.geteuid(), os.environ.get("XDG_RUNTIME_DIR")
     if user == 0:
         yield "/run/chainshaper/outputs"
@@ -100,8 +102,10 @@ def page_folders() -> Iterator[str]:
 
 
 def open_page(name: str, topic: str) -> "Page":
-    """The page of an output: the one that is there, or else a new one; ``name`` is that for all who
-    publish the ``topic`` in this domain. OSError: no folder is ours alone, or the file is not.
+    """Open the page of an output, or make it.
+
+    All processes that publish the ``topic`` in this domain use the same ``name``. Raises OSError:
+    no folder is this user's alone, or the file is not.
     """
     domain = os.environ.get("ROS_DOMAIN_ID") or "0"
     problem = OSError("no folder")
@@ -116,35 +120,40 @@ def open_page(name: str, topic: str) -> "Page":
 
 
 def _private(folder: str, flags: int) -> str:
-    """A folder that is ours alone, made where a page is to be. Raises OSError: it is not."""
+    """Return the folder if it is this user's alone; make it where a page is to be made.
+
+    Raises OSError: it is not.
+    """
     if flags & os.O_CREAT:
         _make_private(folder)
-    found = os.lstat(folder)
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:
+    state = os.lstat(folder)
+    if not stat.S_ISDIR(state.st_mode) or state.st_uid != os.geteuid() or state.st_mode & 0o077:
         raise PermissionError("it is not a folder of this user alone (mode 0700)")
     return folder
 
 
 def _make_private(folder: str) -> None:
-    # Not writable by others, whatever the umask: pages of every output are found through it.
+    # Others may not write to the folder above, whatever the umask: pages of all outputs are below.
     os.makedirs(os.path.dirname(folder), 0o755, exist_ok=True)  # noqa: PTH103, PTH120 - of a node's file
     with suppress(FileExistsError):
         os.mkdir(folder, 0o700)  # noqa: PTH102
 
 
 class Page:
-    """A page and its lock; numbers are read and written under the names of :data:`FIELDS`.
+    """A page and its locks; numbers are read and written under the names of :data:`FIELDS`.
 
-    The file is read and written, never mapped: a process that maps a file which another one cuts,
-    or for which the disk has no room, is ended by SIGBUS. What is not there reads as 0, what cannot
-    be written is missing, and shaping goes on.
+    The file is read and written, never mapped: SIGBUS ends a process that maps a file which another
+    process cuts short, or for which the disk has no room. Numbers that are not there read as 0,
+    those that cannot be written are missing, and shaping goes on.
     """
 
     def __init__(
         self, folder: str, name: str, topic: str | None = None, flags: int = os.O_RDONLY
     ) -> None:
-        """With the ``flags`` of `open`; without a ``topic`` the page is only looked at, as it was
-        at the last :meth:`look`. In `/proc`, the folder of a process's open files, all are links.
+        """Open a page with the ``flags`` of `open`.
+
+        Without a ``topic`` the page is only read, as it was at the last :meth:`look`. In `/proc`,
+        the folder of a process's open files, all files are links.
 
         Raises OSError: it cannot be opened, or it is not a file of the folder's owner. ValueError:
         it is too short for a page.
@@ -156,22 +165,22 @@ class Page:
         self._file = os.open(self.path, flags, 0o600)
         self._seen: bytes | None = None
         try:
-            found = os.fstat(self._file)
-            if not stat.S_ISREG(found.st_mode) or found.st_uid != os.lstat(folder).st_uid:
+            state = os.fstat(self._file)
+            if not stat.S_ISREG(state.st_mode) or state.st_uid != os.lstat(folder).st_uid:
                 raise PermissionError(f"{name} is not a file of the folder's owner")
             if topic is None:
                 self.look()
-            else:  # one for which there is no room is of no use to others
+            else:  # a page that has no room on its disk is of no use to others
                 os.posix_fallocate(self._file, 0, _SIZE)
                 text = topic.encode()[:TOPIC_BYTES].ljust(TOPIC_BYTES, b"\0")
                 os.pwrite(self._file, text, 8 * TOPIC)
         except BaseException:
             os.close(self._file)
             raise
-        self._identity, self.owner = (found.st_dev, found.st_ino), found.st_uid
+        self._identity, self.owner = (state.st_dev, state.st_ino), state.st_uid
 
     def _read(self, at: int, size: int) -> bytes:
-        """So many bytes of the page from there on."""
+        """Return ``size`` bytes of the page from ``at`` on; zeros for those that are not there."""
         content = b""
         if self._seen is not None:
             content = self._seen[at : at + size]
@@ -194,7 +203,10 @@ class Page:
         self._write(_AT[field], value)
 
     def look(self) -> None:
-        """Read the page anew, for who only looks. ValueError: it has become shorter, or is gone."""
+        """Read the page again, for a process that only reads it.
+
+        Raises ValueError: it has become shorter, or was removed.
+        """
         if not os.fstat(self._file).st_nlink:
             raise ValueError(f"{self.path} was removed")
         content = os.pread(self._file, _SIZE, 0)
@@ -209,32 +221,35 @@ class Page:
         self[ring] = number + 1
 
     def noted(self, ring: str) -> list[int]:
-        """The latest numbers of a ring, in no order."""
+        """Return the latest numbers of a ring, in no order."""
         return [*self._numbers(_RINGS[ring], RING)]
 
     def latest(self, ring: str, since: int) -> list[int]:
-        """The numbers of a ring behind the first ``since``, as far as they are there."""
+        """Return the numbers of a ring behind the first ``since`` that are still there."""
         last, numbers = self[ring], self.noted(ring)
         return [numbers[number % RING] for number in range(max(since, last - RING), last)]
 
     @property
     def topic(self) -> str:
-        """The output."""
+        """The name of the output."""
         return self._read(8 * TOPIC, TOPIC_BYTES).rstrip(b"\0").decode(errors="replace")
 
     @property
     def is_current(self) -> bool:
-        """Whether others find the page whole: folders of a session go when its user logs out."""
+        """Whether other processes find this page, and whole.
+
+        The folders of a session are removed when its user logs out.
+        """
         try:
-            there = os.stat(self.path)  # noqa: PTH116
+            state = os.stat(self.path)  # noqa: PTH116
         except OSError:
             return False
-        return (there.st_dev, there.st_ino) == self._identity and there.st_size >= _SIZE
+        return (state.st_dev, state.st_ino) == self._identity and state.st_size >= _SIZE
 
     # Locks of open files (F_OFD_…): several in one file, each visible without taking it.
 
     def lock(self, byte: int = PUBLISHING) -> bool:
-        """Take a right, if no process has it; it ends with the process."""
+        """Take a right; return False if another process has it. It ends with this process."""
         try:
             self._ask(fcntl.F_OFD_SETLK, fcntl.F_WRLCK, byte)
         except BlockingIOError:
@@ -246,7 +261,7 @@ class Page:
         self._ask(fcntl.F_OFD_SETLK, fcntl.F_UNLCK, byte)
 
     def is_locked(self, byte: int = PUBLISHING) -> bool:
-        """Whether another process has the right."""
+        """Return whether another process has the right."""
         return self._ask(fcntl.F_OFD_GETLK, fcntl.F_WRLCK, byte) != fcntl.F_UNLCK
 
     def _ask(self, command: int, kind: int, byte: int) -> int:
@@ -254,13 +269,15 @@ class Page:
         return int(struct.unpack(_FLOCK, answer)[0])
 
     def close(self) -> None:
-        """Give up the page, and with it whatever it has locked."""
+        """Close the page, which gives up all its locks."""
         os.close(self._file)
 
 
 class Turn:
-    """The shaping node's side: whose turn it is to publish a message, which its source timestamp
-    names; where that is not known (None), none is left out.
+    """The shaping node's side: whether it is this node's turn to publish a message.
+
+    The key of a message is its source timestamp; where that is not known (None), the node leaves no
+    message out.
     """
 
     def __init__(self, name: str, topic: str) -> None:
@@ -276,30 +293,33 @@ class Turn:
 
     def _open(self) -> None:
         page, parent = open_page(self._name, self._topic), os.getppid()
-        # Phase and mode are one launch's. All launches have one parent in some containers, and of
-        # systemd: there it is the same one if little time has passed.
+        # Phase and mode belong to one launch, which is known by its parent process. In some
+        # containers, and under systemd, all launches have the same parent: there it is taken for
+        # the same launch if little time has passed.
         idle_ns = abs(time.monotonic_ns() - page["until_ns"])
         if parent != page["parent"] or idle_ns > AT_ONCE_NS:
             page["mode"] = page["phase_known"] = 0
-            if not page.is_locked():  # by a node of another launch, whose counts they are
+            if not page.is_locked():  # else the counts are those of another launch's node
                 for count in _COUNTS:
                     page[count] = 0
         page["parent"] = parent
         self.page, self._in_force = page, False
-        # Of the standby's messages: how many there were at the last look, and which.
+        # How many messages the standby had dealt with at the last look, and which.
         self._seen, self._bypassed, self._oldest = -1, frozenset[int](), 0
 
     @property
     def wait_s(self) -> float:
-        """For how long to wait before starting: nodes before this one have failed at once."""
+        """How long to wait before the start, since nodes before this one have failed at once."""
         failed = self.page["failed_starts"] - 1 - BACK_OFF_AFTER
-        return (
-            0.0 if failed < 0 else min(10.0, 0.5 * 2 ** min(failed, 10))
-        )  # a page may say anything
+        if failed < 0:
+            return 0.0
+        wait_s: float = 0.5 * 2 ** min(failed, 10)  # `failed` is limited: a page may say anything
+        return min(10.0, wait_s)
 
     def go_on(self, shaper: Shaper) -> None:
-        """Have cycles of a gate begin where they did for the one before it in the same launch, in
-        its mode; the page shows each decision, and says how slots are to be moved.
+        """Give a gate the phase and the mode of the gate before it in the same launch.
+
+        From now on the page shows each of its decisions, and says how its slots are moved.
         """
         modes = [] if shaper.gate.modes is None else [*shaper.gate.modes.bands]
 
@@ -314,7 +334,7 @@ class Turn:
             shaper.switch(modes[mode - 1], 0)
 
     def take(self, key: int | None) -> bool:
-        """Whether a message that was received is this node's to deal with."""
+        """Return whether this node deals with a message that it received."""
         if not self._in_force and not self._come_into_force(key):
             return False
         self.page["until_ns"] = time.monotonic_ns()
@@ -322,47 +342,49 @@ class Turn:
         return not self.was_bypassed(key)
 
     def hold(self, until_ns: int | None, phase_ns: int, mode: int = 0) -> None:
-        """The message is released then (None: never); ``mode`` from 1, 0: there are no modes."""
+        """Note when the message is released (None: never), and the mode, from 1 (0: no modes)."""
         self.page["mode"] = mode
         if until_ns is not None:
             self.page["until_ns"] = until_ns
         self.page["phase_ns"], self.page["phase_known"] = phase_ns, 1
 
     def was_bypassed(self, key: int | None) -> bool:
-        """Whether the standby has dealt with a message."""
+        """Return whether the standby has dealt with a message."""
         count = self.page["bypassed"]
         if count != self._seen:
-            # What the standby is about to publish comes first.
+            # Messages that the standby is about to publish come first.
             give_up = time.monotonic_ns() + GIVE_UP_NS
             while self.page.is_locked(PASSING) and time.monotonic_ns() < give_up:
                 time.sleep(0.0001)
             self._bypassed = frozenset(self.page.noted("bypassed"))
             if self._seen >= 0 and count - self._seen > RING:
-                self._oldest = min(self._bypassed)  # older ones were, too
+                self._oldest = min(self._bypassed)  # it has dealt with all older ones, too
             self._seen = count
         if key is None or (key not in self._bypassed and key >= self._oldest):
-            self._oldest = 0  # what comes now is newer, even if the clock is set back
+            self._oldest = 0  # later messages are newer, even if the clock is set back
             return False
-        self.page["taken"] += 1  # so this node does not hang any more
+        self.page["taken"] += 1  # which tells the standby that this node does not hang
         return True
 
     def done(self, key: int | None) -> None:
-        """A message has been published or discarded."""
+        """Note that a message has been published or discarded."""
         self.page.add("released", key or 0)
         self.page["until_ns"] = time.monotonic_ns()
         self.page["failed_starts"] = 0
         if not self.page.is_current:
             left = self.page
-            with suppress(OSError):  # without a folder this page has to do
+            with suppress(OSError):  # where there is no folder, the node stays with this page
                 self._open()
                 self._move_back = left["moved_from_ns"] != 0
-                for one in left.noted("released"):  # a standby that lags has to know them
-                    self.page.add("released", one)
+                for key_before in left.noted("released"):  # for a standby that lags behind
+                    self.page.add("released", key_before)
                 left.close()
 
     def moved(self) -> tuple[int, int] | None:
-        """How slots are to be moved, for :meth:`.Shaper.move_slots` (None: as they are): back, if
-        the process that moved them is not there any more, or on a page that was left.
+        """Return the arguments of :meth:`.Shaper.move_slots`; None: slots stay as they are.
+
+        Slots go back to the planned ones where the process that moved them has ended, or where it
+        moved them on a page that this node has left.
         """
         if self._move_back:
             self._move_back = False
@@ -373,7 +395,7 @@ class Turn:
         return (by, since) if self.page.is_locked(MOVING) else (0, time.monotonic_ns())
 
     def count(self, outcome: Outcome) -> None:
-        """A message has been published or dropped: it counts, and its latency to its arrival."""
+        """Count a message that has been published or dropped, and its latency to its arrival."""
         message, release = outcome.message, outcome.release
         self.page.add("measured", message.arrival_ns - release.origin_ns)
         self.page[release.dropped or "published"] += 1
@@ -394,7 +416,7 @@ class Turn:
             self._in_force, self._gave_up = True, False
         page["until_ns"] = time.monotonic_ns()
         page["first"], page["holder"] = key or 0, os.getpid()
-        # A standby still deals with what came before this node's first message.
+        # The standby still deals with the messages before this node's first one.
         if page["listening"] and key is not None and not self._gave_up:
             while page.is_locked(STANDING_BY) and time.monotonic_ns() < give_up:
                 if key == page["acknowledged"] or key in page.noted("bypassed"):
@@ -404,11 +426,12 @@ class Turn:
 
 
 class Standby:
-    """The standby's side: passes messages on while no shaping node is in force.
+    """The standby's side: it publishes messages while no shaping node is in force.
 
-    ``publish`` gets the payload, the source timestamp and the arrival of each message that is
-    passed on; ``changed`` a text when a shaping node goes or is back. One that is late by more than
-    ``patience_ns`` is taken to hang. ``silent``: others are told that ``publish`` does not.
+    * ``publish`` gets the payload, the source timestamp and the arrival of each such message.
+    * ``changed`` gets a text when a shaping node goes or is back.
+    * ``patience_ns``: a shaping node that is late by more than this is taken to hang.
+    * ``silent``: the page says that ``publish`` publishes nothing.
     """
 
     def __init__(  # noqa: PLR0917 - each is used once
@@ -440,10 +463,10 @@ class Standby:
             time.sleep(0.01)
         self.page["standby"], self.page["listening"] = os.getpid(), 0
         self.page["bypassing_since_ns"], self.page["silent"] = 0, int(self._silent)
-        self._stuck_at = -1  # what the node had taken when it was found to hang
+        self._stuck_at = -1  # how many messages the node had taken when it was found to hang
 
     def arrived(self, payload: bytes, key: int | None) -> None:
-        """A message has come, for the shaping node and for the standby alike."""
+        """Take a message, which the shaping node receives too."""
         now = time.monotonic_ns()
         with self._mutex:
             self._follow()
@@ -455,28 +478,28 @@ class Standby:
                 self._pass_on(len(self._pending))
                 self.page.unlock()
             else:
-                self._pending.clear()  # what the shaping node holds is lost with it
+                self._pending.clear()  # the messages of the shaping node are lost if it dies
         with suppress(BlockingIOError):
             os.write(self._wake, b".")
 
     def look(self) -> None:
-        """See whether the shaping node still does what it has to."""
+        """Look whether the shaping node still deals with its messages."""
         with self._mutex:
             self._follow()
             self._look(time.monotonic_ns())
 
     def _follow(self) -> None:
-        """Go to the new page, where this one was removed and the shaping node has left it."""
+        """Go to a new page where this one was removed and the shaping node has left it."""
         left = self.page
         if not left.is_current and not left.is_locked():
             with suppress(OSError):
-                self._forget()  # a new page knows of nothing
+                self._forget()  # the new page names no message yet
                 self._open()
                 left.close()
 
     def watch(self) -> None:
-        """Look when the shaping node dies, and when it should have released a message; for ever."""
-        gone = 0  # a process stays readable as one that has ended until its parent takes note
+        """Look when the shaping node dies, and when it is late for a release; for ever."""
+        gone = 0  # a process that has ended can be opened until its parent waits for it
         while True:
             with self._mutex:  # the page may be left meanwhile
                 self._forget()
@@ -498,10 +521,10 @@ class Standby:
             self.look()
             if ended:
                 gone = holder
-                time.sleep(0.001)  # another node with its lock is about to say so
+                time.sleep(0.001)  # another node may have the lock and be about to write its name
 
     def _due_ns(self) -> int:
-        """When the shaping node is too late with what it has to do."""
+        """Return when the shaping node is too late with its message."""
         return max(self.page["until_ns"], self._pending[0].arrival_ns) + self._patience_ns
 
     def _look(self, now: int) -> None:
@@ -516,29 +539,31 @@ class Standby:
             self._stuck_at = taken
             self._gone("is late for its own release: it hangs, or was stopped")
             self.page.lock(PASSING)
-            for waiting in self._pending:  # the node is there, and could go on at any time
+            for waiting in self._pending:  # noted first: the node could go on at any time
                 self.page.add("bypassed", waiting.about)
             self._pass_on(len(self._pending), noted=True)
             self.page.unlock(PASSING)
         elif taken != self._stuck_at:
             self._back()
-            # What came before the first message of the node in force came to this process alone.
+            # Messages before the first one of the node in force came to this process alone.
             first, keys = self.page["first"], [waiting.about for waiting in self._pending]
             if first != self.page["acknowledged"] and first in keys:
                 self._pass_on(keys.index(first))
                 self.page["acknowledged"] = first
 
     def _none_in_force(self) -> bool:
-        """Take the lock, if no shaping node has it."""
+        """Take the lock; return False if a shaping node has it."""
         if not self.page.lock():
             return False
         self.page["holder"] = 0
         return True
 
     def _forget(self) -> None:
-        """Leave out what was dealt with, and what came before: order is not to be broken."""
+        """Forget messages that were dealt with, and those before them: order must not break."""
         known = {*self.page.noted("released"), *self.page.noted("bypassed")}
-        dealt_with = [place for place, one in enumerate(self._pending, 1) if one.about in known]
+        dealt_with = [
+            count for count, waiting in enumerate(self._pending, 1) if waiting.about in known
+        ]
         for _ in range(max(dealt_with, default=0)):
             self._pending.popleft()
 

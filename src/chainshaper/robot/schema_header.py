@@ -7,13 +7,16 @@ TEMPLATE HEADER`, before any package is installed: so only the standard library 
 import re
 import sys
 from collections.abc import Mapping
+from dataclasses import MISSING, Field
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, get_args
 
 from chainshaper.robot import handover
+from chainshaper.robot.decision import DROPPED
+from chainshaper.robot.gate import ANCHORS, INTO_OPEN_SLOT, LATE, MESSAGES, VALUES
 from chainshaper.robot.gate_log import LOG_COLUMNS
-from chainshaper.robot.node_parameters import NodeParameters
+from chainshaper.robot.node_parameters import PARAMETERS
 
 _CPP_TYPES = {
     int: "std::int64_t",
@@ -21,6 +24,16 @@ _CPP_TYPES = {
     list[int]: "std::vector<std::int64_t>",
     list[str]: "std::vector<std::string>",
 }
+
+
+ENUMERATIONS = {
+    "Anchor": ANCHORS,
+    "Policy": LATE,  # of which `overrun` has all but the last
+    "Entry": INTO_OPEN_SLOT,
+    "Messages": MESSAGES,
+    "Dropped": DROPPED,
+}
+"""Types in C++ with the words that their values stand for, in their order."""
 
 
 def schema_header(template: str) -> str:
@@ -48,15 +61,54 @@ def numbers_of(module: ModuleType) -> dict[str, int]:
 def _values() -> dict[str, str]:
     """What stands in each place of the template."""
     numbers = numbers_of(handover) | {"log_columns": len(LOG_COLUMNS)}
-    usual = vars(NodeParameters())
-    types = {name: _CPP_TYPES[kind] for name, kind in NodeParameters.__annotations__.items()}
+    members = [
+        f"{_CPP_TYPES[type_]} {name}{{{_in_cpp(default)}}};"
+        for name, (type_, default) in PARAMETERS.items()
+    ]
     return {
         "CONSTANTS": constants(numbers),
         "LOG_HEADER": '"\n    "'.join(f"{n}," for n in LOG_COLUMNS).removesuffix(","),
         "FIELDS": ", ".join(handover.FIELDS),
-        "PARAMETERS": "\n  ".join(f"{types[n]} {n}{{{_in_cpp(usual[n])}}};" for n in types),
-        "READS": "\n    ".join(f'read("{name}", {name});' for name in types),
+        "PARAMETERS": "\n  ".join(members),
+        "READS": "\n    ".join(f'read("{name}", {name});' for name in PARAMETERS),
+        "GATE_VALUES": "\n    ".join(_gate_value_read(declared) for declared in VALUES),
     }
+
+
+def enumeration_of(declared: "Field[Any]") -> str | None:
+    """Return the type in C++ of a gate's value that is a word; None: it is a number."""
+    words = get_args(declared.type)
+    kinds = (kind for kind, known in ENUMERATIONS.items() if words and known[: len(words)] == words)
+    return next(kinds, None)
+
+
+def gate_values() -> str:
+    """Return the members of `GateValues` in C++, a line each."""
+    lines = []
+    for declared in VALUES:
+        default = 0 if declared.default is MISSING else declared.default
+        if (kind := enumeration_of(declared)) is None:
+            lines.append(f"std::int64_t {declared.name}{{{default}}};")
+        else:
+            lines.append(f"{kind} {declared.name}{{{kind}::{str(default).replace('-', '_')}}};")
+    return "\n  ".join(lines)
+
+
+def gate_value_visits() -> str:
+    """Return the calls in C++ of `visit` with each member of `GateValues`, a line each."""
+    lines = []
+    for declared in VALUES:
+        kind, member = enumeration_of(declared), f"&GateValues::{declared.name}"
+        words = "" if kind is None else f", {kind.lower()}_names"
+        lines.append(f'visit("{declared.name}", {member}{words});')
+    return "\n  ".join(lines)
+
+
+def _gate_value_read(declared: "Field[Any]") -> str:
+    """Return the line in C++ that takes a value of a gate from the parameter of its name."""
+    name, kind = declared.name, enumeration_of(declared)
+    read = name if kind is None else f"word_named<{kind}>({kind.lower()}_names, {name})"
+    return f"values.{name} = {read};"
 
 
 def _in_cpp(value: str | int | list[Any]) -> str:

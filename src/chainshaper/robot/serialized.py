@@ -4,8 +4,10 @@ import struct
 
 
 def origin_of(payload: bytes) -> int | None:
-    """The header stamp (int32 seconds, uint32 nanoseconds, behind the encapsulation header) of a
-    serialized message in ns of its clock, None if it is zero or short.
+    """Return the header stamp of a serialized message in ns of its clock; None: it has none.
+
+    The stamp is an int32 of seconds and a uint32 of nanoseconds behind the encapsulation header; a
+    stamp of zero, or a message that is too short, is none.
     """
     if len(payload) < 12:
         return None
@@ -18,7 +20,7 @@ def origin_of(payload: bytes) -> int | None:
 
 
 def text_of(payload: bytes) -> str | None:
-    """The text of a serialized ``std_msgs/String``, None where the bytes are none."""
+    """Return the text of a serialized ``std_msgs/String``; None: the bytes are none."""
     if len(payload) < 8:
         return None
     length = int.from_bytes(payload[4:8], "little" if payload[1] & 1 else "big")  # with the NUL

@@ -25,46 +25,53 @@ OTHERS_NS = 2_000_000  # the executor's other callbacks take less
 
 
 class Shaper:
-    """A gate at work: holds each message until its release, and minds the clocks.
+    """A gate at work: holds each message until its release.
 
-    Stamps are CLOCK_REALTIME, and the wall clock may be stepped: its offset is taken anew for every
-    message. Messages under way during a step are anchored to the cycle instead, at the phase that
-    the last good stamp had.
+    Stamps are CLOCK_REALTIME, and the wall clock may be stepped: the shaper measures its offset for
+    every message. Messages under way during a step are anchored to the cycle instead, at the phase
+    that the last good stamp had.
 
-    One shaper belongs to one thread, which does nothing else at the time of a release. Its owner
-    sets what it calls: ``look`` has new messages :meth:`arrive`, while others wait, before each
-    release and behind it. ``moved`` says with each message how slots are to be moved
-    (:meth:`move_slots`; None: as before). ``on_waking`` gets the time of a release ``spin_ns``
-    before it; ``on_decision`` each decision, before it is waited for, and where cycles begin.
+    A shaper belongs to one thread, which does nothing else at the time of a release. The owner sets
+    the functions that it calls:
+
+    * ``look`` takes what has come and calls :meth:`arrive` for it; while messages wait, before each
+      release and behind it.
+    * ``moved`` returns the arguments of :meth:`move_slots`, or None where slots stay as they are;
+      with each message.
+    * ``on_waking`` gets the time of a release, ``spin_ns`` before it.
+    * ``on_decision`` gets each decision before the wait for it, and where cycles start.
+
+    ``overflowed`` are the messages that overflowed since the owner emptied this list.
     """
 
     def __init__(self, gate: Gate, spin_ns: int = 0) -> None:
         self.gate, self.queue = gate, Queue(gate)
         self.spin_ns = spin_ns
-        self.overflowed: list[Outcome] = []  # since the owner has emptied it
+        self.overflowed: list[Outcome] = []
         self.look: Callable[[], None] = lambda: None
         self.moved: Callable[[], tuple[int, int] | None] = lambda: None
         self.on_waking: Callable[[int], None] = lambda _: None
         self.on_decision: Callable[[Release, int], None] = lambda *_: None
         self._looked_ns = self._waited_ns = self._turn_ns = 0
         self._offset = clock_offset()
-        self._next_phase: tuple[int, int] | None = None  # from when on, and which
+        self._next_phase: tuple[int, int] | None = None  # from when on, and the phase (ns)
         self._thread, self._schedstat = 0, -1
 
     def set_phase(self, phase_ns: int, now_ns: int) -> None:
-        """Cycles begin elsewhere, from the first such beginning after ``now_ns`` on."""
+        """Start cycles at another phase, from the first such start after ``now_ns`` on."""
         self._next_phase = (now_ns + (phase_ns - now_ns) % self.gate.cycle_ns, phase_ns)
 
     def move_slots(self, by_ns: int, from_ns: int) -> None:
-        """Slots of cycles that begin at ``from_ns`` or later are moved by so much from where the
-        gate has them, unless that is where they are, or they would leave the cycle.
+        """Move the slots of cycles that start at ``from_ns`` or later from where the gate has them.
+
+        Nothing changes where they are moved so already, or would leave the cycle.
         """
         moves = self.queue.moves
         if by_ns != (moves[-1][1] if moves else 0) and self.gate.may_move(by_ns):
             moves.append((from_ns, by_ns))
 
     def switch(self, mode: str | None, now_ns: int) -> bool:
-        """A mode is announced, in force from the next cycle on; False: there is none like it."""
+        """Put a mode in force from the next cycle on; return False if there is no such mode."""
         modes, changes = self.gate.modes, self.queue.changes
         if modes is None or mode is None or mode not in modes.bands:
             return False
@@ -80,8 +87,10 @@ class Shaper:
         about: Any = None,
         lost: int | None = None,
     ) -> None:
-        """A message was taken now. With ``source_ns`` (CLOCK_REALTIME) it counts as having come
-        then, if that is after the last look: it waited in the reader.
+        """Queue a message that was taken now.
+
+        ``source_ns`` (CLOCK_REALTIME) is for one that waited in the reader: it counts as having
+        come then, if that is after the last look.
         """
         offset = clock_offset()
         stepped = abs(offset - self._offset) > STEP_NS
@@ -94,17 +103,19 @@ class Shaper:
         if self._next_phase is not None and arrival >= self._next_phase[0]:
             self.queue.phase_ns = self._next_phase[1]
             self._next_phase = None
-        if (moved := self.moved()) is not None:
-            self.move_slots(*moved)
+        if (move := self.moved()) is not None:
+            by_ns, from_ns = move
+            self.move_slots(by_ns, from_ns)
         stamp = None if stamp is None else stamp - offset
-        if (full := self.queue.arrive(payload, arrival, stamp, about, lost)) is not None:
-            self.overflowed.append(full)
+        overflowed = self.queue.arrive(payload, arrival, stamp, about, lost)
+        if overflowed is not None:
+            self.overflowed.append(overflowed)
 
     def hold(self) -> Outcome | None:
-        """Wait until the oldest message leaves, or is dropped; None: it was overflowed meanwhile.
+        """Wait until the oldest message leaves or is dropped; None: it overflowed meanwhile.
 
-        Where overruns are discarded, so is a message that came in time and would leave behind its
-        slot because this thread woke late.
+        Where overruns are discarded, so is a message that came in time but would leave behind its
+        slot because this thread woke up late.
         """
         queue = self.queue
         message, now = queue.waiting[0], time.monotonic_ns()
@@ -128,7 +139,7 @@ class Shaper:
             if slept:
                 self.on_waking(release.at_ns)
                 if time.monotonic_ns() < release.at_ns:
-                    # Awake in time: what other threads took before is of no consequence.
+                    # This thread is awake in time: other threads before that delayed nothing.
                     self._waited_ns = self._others_ran_ns()
             now = watch_until(release.at_ns)
             if self.gate.policy == "discard" and missed(self.gate, release, now):
@@ -142,7 +153,7 @@ class Shaper:
         self._looked_ns = now
 
     def nothing_due(self, until_ns: int | None = None) -> bool:
-        """Whether there is time for something else, until an instant, before the next release."""
+        """Return whether nothing is to be released until an instant (default: in a short while)."""
         if not self.queue.waiting:
             return True
         at_ns = self.queue.decide().at_ns
@@ -150,7 +161,7 @@ class Shaper:
         return at_ns is not None and at_ns > until_ns + self.spin_ns
 
     def rest(self, published_ns: int, pause_ns: int) -> None:
-        """Pause behind a publication, unless another message has to leave meanwhile."""
+        """Rest behind a publication, unless another message has to leave meanwhile."""
         self.queue.free_ns = published_ns
         self._look()
         if self.nothing_due(published_ns + pause_ns):
@@ -158,17 +169,21 @@ class Shaper:
             self.queue.free_ns = time.monotonic_ns()
 
     def time_lost(self, release: Release, until_ns: int) -> int:
-        """How much of the delay from a release until now, right after publishing, no thread used:
-        interrupts, or a core that was taken away from the whole system (ns).
+        """Return how much of the delay from a release until ``until_ns`` no thread used (ns).
+
+        Interrupts took that, or the core was taken away from the whole system. To be called right
+        after publishing.
         """
         since_ns = max(release.at_ns or 0, self._turn_ns)
         return max(0, until_ns - since_ns - (self._others_ran_ns() - self._waited_ns))
 
     def _others_ran_ns(self) -> int:
-        """For how long this thread has been ready while others ran, by the second number of its
-        schedstat (kernel: scheduler/sched-stats.rst); without one, all delay is other threads'.
+        """Return for how long this thread has been ready while others ran (ns).
+
+        That is the second number of its schedstat (kernel: scheduler/sched-stats.rst); without one,
+        all delay counts as other threads'.
         """
-        if self._thread != threading.get_ident():  # the file is bound to who opened it
+        if self._thread != threading.get_ident():  # the file belongs to the thread that opened it
             self._thread, self._schedstat = threading.get_ident(), -1
             with suppress(OSError):
                 self._schedstat = os.open("/proc/thread-self/schedstat", os.O_RDONLY)

@@ -13,15 +13,15 @@ from typing import Literal, TypeAlias, get_args
 
 Rule: TypeAlias = Literal["newest", "first"]
 RULES = get_args(Rule)
-EARLY_DIVISOR = 5  # a message may come early by a period divided by this
+EARLY_DIVISOR = 5  # a message may come early by the period divided by this
 
 
 class FirstOfPeriod:
-    """The rule ``first`` for one topic; times are ns of CLOCK_MONOTONIC, ascending.
+    """The rule ``first`` for one topic. Times are ns of CLOCK_MONOTONIC, ascending.
 
-    k + 1 messages that pass take more than k - 1 periods. An input passes whole that comes a period
-    apart or more, or periodically but for delays of at most a fifth of a period. Of one that comes
-    0.8 to 1 periods apart, one message passes in every period.
+    k + 1 messages that pass take more than k - 1 periods. Every message passes of an input whose
+    messages come a period apart or more, or periodically but for delays of at most a fifth of a
+    period. Of an input whose messages come 0.8 to 1 periods apart, one passes in every period.
     """
 
     def __init__(self, period_ns: int) -> None:
@@ -29,7 +29,7 @@ class FirstOfPeriod:
         self._due_ns = self._passed_ns = -2 * period_ns  # the first one passes
 
     def passes(self, now_ns: int) -> bool:
-        """Whether a message that comes now passes."""
+        """Return whether a message that comes now passes."""
         if now_ns < max(self._due_ns, self._passed_ns + self._period_ns) - self._early_ns:
             return False
         none_came = now_ns >= self._due_ns + self._period_ns - self._early_ns

@@ -11,32 +11,50 @@ from typing import Any
 from chainshaper.robot.decision import Release, moved_at, release_of
 from chainshaper.robot.gate import Gate
 
-CHANGES = 64  # so many changes of the mode, or moves, reach back further than the oldest stamp
+CHANGES = 64  # modes, or moves, that are remembered: they reach back behind the oldest stamp
 
 
 @dataclass(eq=False)
 class Waiting:
-    """A message that has come and not left; times are ns of CLOCK_MONOTONIC."""
+    """A message that waits at a gate. Times are ns of CLOCK_MONOTONIC.
+
+    * ``payload``: the serialized message.
+    * ``arrival_ns``: when it came.
+    * ``stamp_ns``: its origin; None: it has none that is of use.
+    * ``phase_ns``: where cycles started when it came.
+    * ``about``: what the owner of the gate knows of it; in ROS 2 nodes its source timestamp.
+    * ``lost``: messages lost between the one before it and this one; None: not known.
+    """
 
     payload: bytes
     arrival_ns: int
     stamp_ns: int | None
     phase_ns: int
-    about: Any = None  # what its owner knows of it: the source timestamp, in ROS 2 nodes
-    lost: int | None = None  # how many, between the one before it and this one; None: not known
+    about: Any = None
+    lost: int | None = None
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a message: it may leave now, or is dropped."""
+    """A message that leaves the queue: it may be published now, or is dropped.
+
+    ``awake_ns`` is when the thread of the gate knew that (CLOCK_MONOTONIC).
+    """
 
     message: Waiting
     release: Release
-    awake_ns: int  # when that was clear (CLOCK_MONOTONIC)
+    awake_ns: int
 
 
 class Queue:
-    """The messages that wait at a gate, and which of them leave. It knows no clock."""
+    """The messages that wait at a gate, and which of them leave. It reads no clock.
+
+    * ``phase_ns``: where cycles start, for messages whose stamp is of no use.
+    * ``waiting``: the messages, the oldest first.
+    * ``changes``, ``moves``: see :func:`.release_of`.
+    * ``free_ns``: when the gate's thread was done with the message before; the oldest one leaves
+      after that.
+    """
 
     def __init__(self, gate: Gate) -> None:
         self.gate = gate
@@ -44,16 +62,17 @@ class Queue:
         self.waiting: deque[Waiting] = deque()
         self.changes: deque[tuple[int, str]] = deque(maxlen=CHANGES)
         self.moves: deque[tuple[int, int]] = deque(maxlen=CHANGES)
-        self.free_ns = 0  # when it is the turn of the oldest message, if it is there then
-        # When cycles start: the one that the oldest message, or another for it, leaves in, and
-        # the one in which the last has left.
+        self.free_ns = 0
+        # The start of the cycle that the oldest message leaves in, or a newer one in its place.
         self._leaving: int | None = None
+        # The start of the cycle in which the last message left.
         self._left: int | None = None
         self._unsure_until_ns = 0
 
     def doubt_stamps(self, now_ns: int) -> None:
-        """The wall clock was stepped: stamps of messages that are under way may be of either side
-        of the step. They are of no use until the last of these has come.
+        """Use no stamps until all messages that are under way now have come.
+
+        The wall clock was stepped: the stamps of these are from before or from after the step.
         """
         self._unsure_until_ns = now_ns + (self.gate.due_cycles + 1) * self.gate.cycle_ns
 
@@ -65,7 +84,7 @@ class Queue:
         about: Any = None,
         lost: int | None = None,
     ) -> Outcome | None:
-        """A message came; the one for which there is no room any more."""
+        """Queue a message; return the one that overflowed, or None."""
         stamp_ns = None if arrival_ns < self._unsure_until_ns else stamp_ns
         message = Waiting(payload, arrival_ns, stamp_ns, self.phase_ns, about, lost)
         self.waiting.append(message)
@@ -77,7 +96,7 @@ class Queue:
         return Outcome(oldest, self._release(oldest, arrival_ns).dropping("overflowed"), arrival_ns)
 
     def decide(self) -> Release:
-        """When the oldest message may leave, or why it never does."""
+        """Decide when the oldest message may leave, or why it never does."""
         oldest = self.waiting[0]
         ready = max(oldest.arrival_ns, self.free_ns)
         release = self._release(oldest, ready)
@@ -93,14 +112,17 @@ class Queue:
         return release
 
     def replaced(self, release: Release, now_ns: int) -> bool:
-        """Whether a newer message leaves for the oldest one, which was to leave like this."""
+        """Return whether a newer message leaves in place of the oldest, which was to leave so."""
         if self.gate.messages != "newest" or release.slot is None:
             return False
-        others = (self._release(newer, now_ns) for newer in islice(self.waiting, 1, None))
-        return any(one.slot is not None and self._same_cycle(one, self._leaving) for one in others)
+        newer = (self._release(message, now_ns) for message in islice(self.waiting, 1, None))
+        return any(
+            decision.slot is not None and self._same_cycle(decision, self._leaving)
+            for decision in newer
+        )
 
     def leave(self, release: Release | None, now_ns: int) -> None:
-        """The oldest message leaves, or is dropped; None: it is not this gate's to decide."""
+        """Take the oldest message out, as decided; ``release`` None: another process decided."""
         self.waiting.popleft()
         self.free_ns = now_ns
         if release is not None and release.slot is not None:
@@ -108,13 +130,19 @@ class Queue:
 
     def _release(self, message: Waiting, ready_ns: int) -> Release:
         return release_of(
-            *(self.gate, message.arrival_ns, message.stamp_ns, self.changes),
+            self.gate,
+            message.arrival_ns,
+            message.stamp_ns,
+            self.changes,
             ready_ns=ready_ns,
             phase_ns=message.phase_ns,
             moves=self.moves,
         )
 
     def _same_cycle(self, release: Release, start_ns: int | None) -> bool:
-        """Stamps are not quite periodic: cycles are the same less than half a cycle apart."""
+        """Return whether a message leaves in the cycle that starts at this time.
+
+        Stamps are not quite periodic: starts less than half a cycle apart are of one cycle.
+        """
         cycle_ns = self.gate.cycle_ns
         return start_ns is not None and 2 * abs(release.start_ns(cycle_ns) - start_ns) < cycle_ns

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from chainshaper import _core
 from chainshaper.planning.chain_plan import ReceiverPlace, Server
 from chainshaper.planning.plan import Plan
-from chainshaper.robot.node_parameters import SAME
+from chainshaper.robot.gate import values_of
 from chainshaper.simulation.system import ROLES, Entity, SimulatedPublisher, System
 from chainshaper.values.errors import InputError
 from chainshaper.workload.description import CallbackDescription, ExecutionTime, TopicDescription
@@ -324,7 +324,7 @@ class Machine:
             described.due_ns = self._timing.start_ns + entity.described.phase_ns
         else:
             topic = system.application.topic(entity.topic)
-            described.depth = topic.depth if gate is None or entity.listens else gate.depth
+            described.depth = topic.depth if gate is None or entity.listens else gate.gate().depth
             described.lifespan_ns = topic.lifespan_ns
 
     def _gate(self, described: CallbackDescription) -> _core.GateDescription:
@@ -332,11 +332,11 @@ class Machine:
         assert gate is not None  # noqa: S101 - the caller has seen it
         found = _core.GateDescription(
             slots=list(gate.slots),
-            depth=gate.depth,
+            depth=gate.gate().depth,
             moves=gate.moved(timing.start_ns),
             spin_ns=gate.spin_ns,
             pause_ns=gate.pause_ns,
-            **{name: getattr(gate, name) for name in SAME if name != "phase_ns"},
+            **values_of(gate.gate()),
         )
         found.phase_ns = timing.anchor_ns
         if gate.phase_ns is not None:

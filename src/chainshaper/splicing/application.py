@@ -6,6 +6,8 @@ republishes on the original one is added. Where the plan gates the publisher's o
 output gets the lifespan by which DDS discards what overran.
 """
 
+from typing import Any
+
 from chainshaper.planning.chain_plan import (
     ChainPlan,
     ShapingNode,
@@ -14,7 +16,7 @@ from chainshaper.planning.chain_plan import (
 )
 from chainshaper.planning.overruns import Writer, check_publication, output_lifespan
 from chainshaper.planning.plan import Plan
-from chainshaper.robot.node_parameters import SAME
+from chainshaper.robot.gate import values_of
 from chainshaper.splicing.gate_settings import gate_of
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError
@@ -30,34 +32,32 @@ from chainshaper.workload.description import (
 
 
 def splice_application(application: Application, plan: Plan) -> Application:
-    """The application as the plan wants it to run, with chains at its offsets, as a new one.
+    """Return the application as the plan has it run, with its shaping nodes and chains at offsets.
 
     Raises InputError: the plan shapes nothing, or does not fit the application.
     """
     application = _placed(at_offsets(application, plan), plan)
     for chain in plan.chains:
         application = _with_chain(application, chain)
-    own = {*map(node_name, application.nodes)}
+    described = {*map(node_name, application.nodes)}
     planned = {thread.node for server in plan.servers for thread in server.threads}
-    if strange := planned - own - {node.thread.node for node in plan.shaping_nodes}:
+    if strange := planned - described - {node.thread.node for node in plan.shaping_nodes}:
         raise InputError(
             f"the plan names {', '.join(sorted(strange))}, which {application.name!r} does not have"
-            f" (its nodes: {', '.join(sorted(own))}): correct the plan, or plan from a recording of"
-            " this application"
+            f" (its nodes: {', '.join(sorted(described))}): correct the plan, or plan from a"
+            " recording of this application"
         )
     return application
 
 
 def at_offsets(application: Application, plan: Plan) -> Application:
-    """The application with timers that expire at the offsets of the chains that they start.
+    """Return the application with timers that expire at the offsets of the chains they start.
 
-    InputError: the application lacks a chain of the plan, or it has another period there.
+    Raises InputError: the application lacks a chain of the plan, or it has another period there.
     """
     for chain in plan.chains:
-        (name, timer), period_ns = (
-            origin_timer(application, chain.chain.spec),
-            chain.chain.period_ns,
-        )
+        name, timer = origin_timer(application, chain.chain.spec)
+        period_ns = chain.chain.period_ns
         if timer.timer_ns != period_ns:
             raise InputError(
                 f"the plan is for a chain with the period {duration_text(period_ns)}, but"
@@ -68,13 +68,16 @@ def at_offsets(application: Application, plan: Plan) -> Application:
         if plan.moves_timers:
             node = application.nodes[name]
             moved = timer.model_copy(update={"phase_ns": chain.offset_ns})
-            callbacks = tuple(moved if one is timer else one for one in node.callbacks)
+            callbacks = tuple(
+                moved if callback is timer else callback for callback in node.callbacks
+            )
             nodes = {**application.nodes, name: node.model_copy(update={"callbacks": callbacks})}
             application = application.model_copy(update={"nodes": nodes})
     return application
 
 
 def _with_chain(application: Application, plan: ChainPlan) -> Application:
+    """Return the application with the shaping nodes, or the topic's lifespan, of one chain."""
     shaping = plan.shaping_node
     if shaping is None and any(publisher_servers(plan)):
         check_publication(plan, writers_of(application))
@@ -104,7 +107,7 @@ def _with_chain(application: Application, plan: ChainPlan) -> Application:
 
 
 def nothing_to_splice(plan: ChainPlan) -> InputError:
-    """The error for a plan without a shaping node."""
+    """Return the error for a plan without a shaping node."""
     return InputError(
         f"the plan has no `shaping_node`, so there is nothing to splice: put {plan.policy} in force"
         " with `chainshaper apply plan.yaml`, or plan with --policy shaped"
@@ -112,30 +115,31 @@ def nothing_to_splice(plan: ChainPlan) -> InputError:
 
 
 def _placed(application: Application, plan: Plan) -> Application:
-    """The application with nodes where the servers have them: core, and rank where they differ;
-    and who receives an output in the place for that, behind the shaping nodes.
+    """Return the application with its nodes on the cores and priorities of their servers.
+
+    Nodes that receive an output get the place that the plan has for them, below the shaping nodes.
     """
-    publishing = {one.name for chain in plan.chains for one in publishing_servers(chain)}
+    publishing = {server.name for chain in plan.chains for server in publishing_servers(chain)}
     running = [server for server in plan.servers if server.name not in publishing]
     server_of = {thread.node: server for server in running for thread in server.threads}
     best = min((server.priority for server in running), default=1)
     nodes = dict(application.nodes)
     for name, node in application.nodes.items():
         if (server := server_of.get(node_name(name))) is not None:
-            own = application.scheduling_of(name)
-            rank = max(1, own.priority - (server.priority - best))
-            if (own.core, own.priority, node.bound) != (server.core, rank, True):
+            described = application.scheduling_of(name)
+            rank = max(1, described.priority - (server.priority - best))
+            if (described.core, described.priority, node.bound) != (server.core, rank, True):
                 placed = {"core": server.core, "priority": rank, "bound": True}
                 nodes[name] = node.model_copy(update=placed)
         elif (place := plan.receivers_at.get(node_name(name))) is not None:
-            gates = (one.fifo_priority for one in plan.shaping_nodes)
+            gates = (shaping.fifo_priority for shaping in plan.shaping_nodes)
             receiving = {"core": place.core, "priority": max(1, min(gates) - 1)}
             nodes[name] = node.model_copy(update=receiving)
     return application.model_copy(update={"nodes": nodes})
 
 
 def _spliced(application: Application, plan: ChainPlan, shaping: ShapingNode) -> Application:
-    """The application with one shaping node behind the publisher of its output."""
+    """Return the application with one shaping node behind the publisher of its output."""
     if shaping.name in {name.strip("/") for name in application.nodes}:
         raise InputError(
             f"the application has a node {shaping.name!r} already, the name that the plan gives to "
@@ -166,13 +170,13 @@ def _spliced(application: Application, plan: ChainPlan, shaping: ShapingNode) ->
     if shaping.output in topics:
         topics[shaping.input] = topics[shaping.output]  # the same quality of service
     first, arrow, others = application.chain.partition("..")
-    starts = arrow and first.strip() == shaping.output  # it does where it did
+    starts = arrow and first.strip() == shaping.output  # the chain begins with the same message
     chain = f"{shaping.input}..{others}" if starts else application.chain
     return application.model_copy(update={"nodes": nodes, "topics": topics, "chain": chain})
 
 
 def writers_of(application: Application) -> list[Writer]:
-    """Who publishes what in a described application, and how."""
+    """Return who publishes what in a described application, and how."""
     return [
         Writer(
             node=node_name(name),
@@ -186,8 +190,9 @@ def writers_of(application: Application) -> list[Writer]:
 
 
 def _described(plan: ChainPlan, shaping: ShapingNode, depth: int, phase_ns: int) -> NodeDescription:
+    """Return the description of a shaping node."""
     gate = gate_of(plan, shaping, depth)
-    described = {name: getattr(gate, name) for name in (*SAME, "slots", "depth")}
+    described: dict[str, Any] = {**values_of(gate), "slots": gate.slots, "depth": gate.depth}
     described |= {"phase_ns": phase_ns, "spin_ns": shaping.spin_ns, "pause_ns": shaping.pause_ns}
     if gate.modes is not None and plan.modes is not None:
         described["modes"] = {"topic": plan.modes.topic, **vars(gate.modes)}

@@ -21,8 +21,8 @@ GATES = "CHAINSHAPER_GATES"
 
 
 def gate_of(plan: ChainPlan, node: ShapingNode, depth: int = DEPTH) -> Gate:
-    """The gate of a plan's shaping node, with room for so many messages."""
-    server = server_of(plan, node.thread)  # a plan without one for a shaping node is refused
+    """Return the gate of a plan's shaping node, with room for ``depth`` messages."""
+    server = server_of(plan, node.thread)  # there is one, or the plan was refused
     modes = plan.modes if node == plan.shaping_node else None
     # Plans number bands from 1, as people do; a gate numbers its slots from 0.
     bands = {} if modes is None else {mode: band - 1 for mode, band in modes.bands.items()}
@@ -41,7 +41,7 @@ def gate_of(plan: ChainPlan, node: ShapingNode, depth: int = DEPTH) -> Gate:
 
 
 def shaping_parameters(plan: ChainPlan, node: ShapingNode, log: Path | None) -> dict[str, Any]:
-    """The ROS parameters of a shaping node, by the names of :class:`NodeParameters`."""
+    """Return the ROS parameters of a shaping node (:class:`.NodeParameters`)."""
     mode_topic = "" if plan.modes is None else plan.modes.topic
     parameters = gate_parameters(gate_of(plan, node), mode_topic) | {
         "depth": node.depth or 0,
@@ -58,12 +58,16 @@ def shaping_parameters(plan: ChainPlan, node: ShapingNode, log: Path | None) -> 
 
 
 def page_name(node: ShapingNode, place: Path) -> str:
-    """Of the page of an output: the files may be moved before they are used, the log may not."""
+    """Return the name of an output's page (:mod:`chainshaper.robot.handover`).
+
+    ``place`` tells it from the pages of other launches: a file that is not moved before its use,
+    such as the log.
+    """
     return f"{node.name}.{hashlib.sha256(str(place.absolute()).encode()).hexdigest()[:8]}"
 
 
 def gate_settings(plan: ChainPlan, node: ShapingNode, publisher: str, log: Path) -> str:
-    """The block of an output in the file that :data:`GATES` names, a line for each value."""
+    """Return the lines of an output in the file that :data:`GATES` names."""
     values = {
         "output": node.output,
         "input": node.input,
@@ -76,7 +80,7 @@ def gate_settings(plan: ChainPlan, node: ShapingNode, publisher: str, log: Path)
 
 
 def delivery_settings(node: ShapingNode) -> str:
-    """The block of an output that is handed to its receivers at a constant time; none: empty."""
+    """Return the lines of an output that receivers get at a constant time; "": it is not one."""
     if node.delivery_ns is None:
         return ""
     values = {"output": node.output, "delivery_ns": node.delivery_ns}
@@ -84,11 +88,14 @@ def delivery_settings(node: ShapingNode) -> str:
 
 
 def settings_text(values: Mapping[str, Any]) -> str:
-    """A block of that file: ``NAME VALUE``, once for each value of a list; ``output`` is first."""
-    several = {name: one if isinstance(one, list) else [one] for name, one in values.items()}
-    return "".join(f"{name} {value}\n" for name, own in several.items() for value in own)
+    """Return lines ``NAME VALUE``, one for each value of a list; ``output`` comes first."""
+    lines = []
+    for name, value in values.items():
+        listed = value if isinstance(value, list) else [value]
+        lines += [f"{name} {entry}\n" for entry in listed]
+    return "".join(lines)
 
 
 def gate_library() -> Path:
-    """The library with both gates, which was built with the package."""
+    """Return the library with both gates, which was built with the package."""
     return native_library("libchainshaper_gate.so")

@@ -36,7 +36,7 @@ class MessageType:
 
 
 def message_type_named(text: str) -> MessageType:
-    """The message type of this name.
+    """Return the message type of this name.
 
     Raises InputError: it is no type's name, or not installed where there is a ROS 2 environment.
     """
@@ -63,7 +63,7 @@ def message_type_named(text: str) -> MessageType:
 
 
 def has_bytes(message_type: str) -> bool:
-    """Whether a message of the ROS 2 environment has a field ``uint8[]``."""
+    """Return whether a message type of the ROS 2 environment has a field ``uint8[]``."""
     package, _, name = message_type.partition("/msg/")
     definitions = (folder / f"{name}.msg" for folder in _message_folders(package))
     texts = (text_of(path.read_bytes()) for path in definitions if path.is_file())

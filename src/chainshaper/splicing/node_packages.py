@@ -17,9 +17,9 @@ _CORE = native_library("core")  # the headers that the library was built from
 
 
 def cpp_package(shaped: MessageType | None = None, *, component: bool = False) -> dict[str, str]:
-    """The files of the package for one type, or for all: paths inside it, and their text."""
+    """Return the text of the package's files by their paths in it, for one type or for all."""
     # The modes of the system are a std_msgs/String.
-    messages = sorted({"std_msgs", *([] if shaped is None else [shaped.package])})
+    messages = sorted({"std_msgs"} if shaped is None else {"std_msgs", shaped.package})
     depends = [*messages, "rclcpp_components"] if component else messages
     values = {
         "PROJECT": GENERIC_PACKAGE,
@@ -47,7 +47,7 @@ def cpp_package(shaped: MessageType | None = None, *, component: bool = False) -
         if path.name == "schema.hpp.in":
             text = schema_header(text)
         elif path.suffix == ".in":
-            text = re.sub("@([A-Z_]+)@", lambda found: values.get(found[1], found[0]), text)
+            text = re.sub("@([A-Z_]+)@", lambda place: values.get(place[1], place[0]), text)
         files[str(path.relative_to(NODES / "cpp")).removesuffix(".in")] = text
     for path in sorted((_CORE / "gate").glob("*.hpp")):
         files[f"include/gate/{path.name}"] = path.read_text(encoding="utf-8")
@@ -73,7 +73,7 @@ def missing_build_tool() -> tuple[str, str] | None:
 
 
 def check_build_tools() -> None:
-    """PlatformError: colcon, CMake, a compiler or the ROS 2 environment is missing."""
+    """Raise PlatformError if colcon, CMake, a compiler or the ROS 2 environment is missing."""
     if (lacks := missing_build_tool()) is not None:
         missing, remedy = lacks
         raise PlatformError(
@@ -82,7 +82,7 @@ def check_build_tools() -> None:
 
 
 def build_package(folder: Path) -> Path:
-    """Build the packages in a folder with colcon; the file to source, ``install/setup.bash``.
+    """Build the packages in a folder with colcon; return the file to source.
 
     Raises PlatformError: see :func:`check_build_tools`. OperationError: the build failed.
     """

@@ -9,10 +9,11 @@ _SOURCES = Path(__file__).parents[2]
 
 
 def python_node(executable: str) -> str:
-    """The one file of a Python node: the gate as it is, what it needs of ROS 2, and the node."""
+    """Return the text of the one file of a node in Python."""
     parts: dict[Path, str] = {}
 
-    def add(path: Path) -> None:  # without its imports of ours, behind the files that these name
+    def add(path: Path) -> None:
+        """Add a file without its imports of chainshaper, behind the files that these name."""
         text = path.read_text(encoding="utf-8")
         lines = text.splitlines(keepends=True)
         for statement in reversed(ast.parse(text).body):

@@ -1,11 +1,11 @@
 """Redirects topics of nodes while `ros2 launch` starts them, in the Python of ROS 2.
 
 This file is written beside the launch file that loads it: it needs the standard library, `launch`
-and `launch_ros` only. Two functions of these know a node's name and remap rules in full (Humble to
-Rolling): `Executable.prepare` has made the command line of a process, and
-`get_composable_node_load_request` the request to a container. Behind both, rules are added for the
-nodes that are meant, each bound to the node's name (``ndt:/pose:=…``). Where the shaping node is a
-component, a request for it follows that of the publisher.
+and `launch_ros` only. Two of their functions know a node's name and remap rules in full (Humble to
+Rolling): `Executable.prepare` makes the command line of a process, and
+`get_composable_node_load_request` the request to a container. After both, this module adds rules
+for the nodes to be redirected, each bound to the node's name (``ndt:/pose:=…``). Where the shaping
+node is a component, a request to load it follows the one for the publisher.
 
 ROS 2 follows the first rule that matches a name, and does not match the result again (upstream:
 `rcl_remap_first_match`). So a rule that leads to the topic is preceded by ours for the same name,
@@ -22,10 +22,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-WITHIN = "chainshaper_within"  # a launch argument: how long (s) after its start all has to run
+WITHIN = "chainshaper_within"  # launch argument: seconds from the start until all nodes run
 WITHIN_S = 30.0
-DISCOVERY_S = 5.0  # how long before that it begins to listen for who publishes and subscribes
-MOST_LOOKS = 10  # at who publishes, a second apart, while discovery has not named all nodes
+DISCOVERY_S = 5.0  # for so long before that the launch listens for publishers and subscribers
+MOST_LOOKS = 10  # looks for publishers, a second apart, while discovery has not named all nodes
 UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # of an endpoint that was discovered before its node was (rmw)
 
 _DRY_RUN = "chainshaper_dry_run"
@@ -33,51 +33,70 @@ _RULE = re.compile(r"(?:(\w+):(?!//|=))?(?:rostopic://)?([^:]+):=(.+)", re.DOTAL
 _NOT_LOADED = (
     "no launch file has a container load {}, and its shaping node is a component (what `ros2 "
     "component load` loads cannot be redirected: load it in a launch file; if it is a process, "
-    "splice with another --node)"
+    "splice with --node python)"
 )
 _FOR_A_SHELL = re.compile(r"[\[;&|<>()$`*?~#\n]")
 _LITERAL = re.compile(r"""'[^']*'|("(?:\\.|[^"\\])*"|\\.)""", re.DOTALL)
-"""What is between single quotes; or, to be kept, what has no such beginning in it."""
+"""Text in single quotes; or (group 1) text in double quotes, or a character behind a backslash."""
 
 
 @dataclass
 class Started:
-    """A process or component that is, or may be, ``node``."""
+    """A process or component that is, or may be, a node to be redirected.
+
+    * ``node``: that node, by its full name.
+    * ``label``: what messages call it.
+    * ``named``: whether the launch names the node; else the rules apply if the executable does so.
+    * ``rules``: the remap rules that were added.
+    * ``action``: of launch, for a process; it knows when that has ended.
+    """
 
     node: str
     label: str
-    named: bool  # by the launch; else ROS 2 follows the rules if the executable is of that name
-    rules: Sequence[str]  # that were added
-    action: Any = None  # a process's, which knows when that has ended
+    named: bool
+    rules: Sequence[str]
+    action: Any = None
 
 
 @dataclass
 class Redirect:
-    """``nodes`` (full names) have ``target`` in place of ``topic``, as a ``kind`` of endpoint."""
+    """A topic that nodes have another one in place of, and what was seen of that.
 
-    kind: str  # publisher or subscription
+    * ``kind``: of their endpoints, ``publisher`` or ``subscription``.
+    * ``topic``, ``target``: the topic, and the one in its place.
+    * ``nodes``: the nodes to be redirected, by their full names.
+    * ``added``: the nodes that splicing added, which have the topic instead.
+    * ``component``: the node that was added, if a container is to load it.
+    * ``started``: processes and components that are, or may be, nodes to be redirected.
+    * ``others``: everything else that was started.
+    * ``elsewhere``: nodes that have another topic by a remap rule of the user's.
+    * ``loaded``: whether a container was asked to load the component.
+    """
+
+    kind: str
     topic: str
     target: str
     nodes: Sequence[str]
-    added: Sequence[str]  # our own nodes, which have the topic instead
-    component: dict[str, Any] | None = None  # our own node, where a container is to load it
+    added: Sequence[str]
+    component: dict[str, Any] | None = None
     started: list[Started] = field(default_factory=list)
-    others: list[str] = field(default_factory=list)  # what else was started
-    elsewhere: list[str] = field(default_factory=list)  # who has another topic by its own rule
-    loaded: bool = False  # whether a container was asked to load the component
+    others: list[str] = field(default_factory=list)
+    elsewhere: list[str] = field(default_factory=list)
+    loaded: bool = False
 
     def values(self) -> dict[str, Any]:
-        """What a launch file says of it, and a dry run is asked."""
+        """Return the arguments that the launch file, or a dry run, makes it again from."""
         keys = ("kind", "topic", "target", "nodes", "added", "component")
-        return {key: one for key in keys if (one := getattr(self, key)) is not None}
+        values = {key: getattr(self, key) for key in keys}
+        return {key: value for key, value in values.items() if value is not None}
 
     def see(
         self, rules: Sequence[str], label: str, action: Any = None, given: Sequence[str] = ("", "")
     ) -> list[tuple[int, str]]:
-        """Rules to add to those of a process or component, each before the one of a place.
+        """Note a process or component; return the rules to add, each with the place to put it.
 
-        Its name and namespace are those of its rules, or else ``given``, or else the executable
-        decides; one that is given a name only is taken to stand in no namespace.
+        The name and namespace of its node are those of its ``rules``, or else ``given``, or else
+        the executable decides. A node that is given a name only is taken to be in no namespace.
         """
         name = _of_rule(rules, "__node", "__name") or given[0] or None
         namespace = _of_rule(rules, "__ns") or given[1] or None
@@ -90,22 +109,26 @@ class Redirect:
             there = where if namespace is None and name is None else namespace or ""
             if name not in (None, base) or there.strip("/") != where.strip("/"):
                 continue
-            own = redirecting(rules, node, self.topic, self.target)
-            if own is None:
-                self.elsewhere += [node] if name else []
+            for_node = redirecting(rules, node, self.topic, self.target)
+            if for_node is None:
+                if name:
+                    self.elsewhere.append(node)
                 continue
-            texts = [rule for _, rule in own]
+            texts = [rule for _, rule in for_node]
             self.started.append(Started(node, label, name is not None, texts, action))
-            added += own
-        return sorted(added, key=lambda one: one[0])
+            added += for_node
+        return sorted(added, key=lambda placed: placed[0])
 
     def mistake(self, on_topic: Sequence[str], on_target: Sequence[str]) -> str | None:
-        """What is wrong with who has the topic and who the target, in words, if anything is.
+        """Return what is wrong with the nodes on the topic and on the target; None: nothing.
 
-        A node that launch runs under its name need not have the target yet, but runs once only.
+        A node that launch runs under its name need not have the target yet, but may run only once.
         """
-        run = [one for one in self.started if getattr(one.action, "return_code", None) is None]
-        running = [one.node for one in run if one.named]
+        running = [
+            started.node
+            for started in self.started
+            if started.named and getattr(started.action, "return_code", None) is None
+        ]
         if twice := [node for node in self.nodes if running.count(node) > 1]:
             return f"more was redirected than meant: {_names(twice)} was started more than once"
         lacking = [node for node in self.nodes if node not in {*on_target, *running}]
@@ -117,10 +140,10 @@ class Redirect:
             what = what.format(_names(lacking))
             return f"nothing was redirected: {what}; started were {_names(self.others)}"
         if self.kind == "subscription":
-            past, does = [one for one in on_topic if one in self.nodes], "subscribes to"
+            past, does = [node for node in on_topic if node in self.nodes], "subscribes to"
         else:
-            past, does = [one for one in on_topic if one not in self.added], "publishes"
-            if surplus := [one for one in on_target if one not in self.nodes]:
+            past, does = [node for node in on_topic if node not in self.added], "publishes"
+            if surplus := [node for node in on_target if node not in self.nodes]:
                 too = f"{_names(surplus)} publishes {self.target} too"
                 return f"more was redirected than meant: {too}"
         if self.loaded and not on_topic:
@@ -128,7 +151,7 @@ class Redirect:
         return f"{_names(past)} {does} it past {_names(self.added)}" if past else None
 
     def message(self, problem: str, on_topic: Sequence[str], on_target: Sequence[str]) -> str:
-        """A problem with all that a person needs to see what it comes from."""
+        """Return the text of a problem, with all endpoints that were found and the remedy."""
         return (
             f"{self.topic}: {problem}. {self.kind.capitalize()}s found: of {self.topic} "
             f"{_names(on_topic)}; of {self.target} {_names(on_target)}. Correct the plan or the "
@@ -139,9 +162,9 @@ class Redirect:
 def redirecting(
     rules: Sequence[str], node: str, topic: str, target: str
 ) -> list[tuple[int, str]] | None:
-    """Rules that give a node a target in place of a topic, each before the rule of a place.
+    """Return the rules that give a node a target in place of a topic, each with its place.
 
-    None: its own rules give it another topic.
+    A rule goes before the node's rule in that place. None: the node's rules give it another topic.
     """
     base = node.rpartition("/")[2]
     added: list[tuple[int, str]] = []
@@ -161,7 +184,7 @@ def redirecting(
 
 
 def expanded(name: str, node: str) -> str:
-    """The full name of what a node calls ``name``: absolute, relative, or private (``~/…``)."""
+    """Return the full name of an absolute, relative or private (``~/…``) name in a node."""
     where, _, base = node.rpartition("/")
     name = name.removeprefix("rostopic://").replace("{node}", base)
     name = name.replace("{ns}", where).replace("{namespace}", where)
@@ -173,9 +196,9 @@ def expanded(name: str, node: str) -> str:
 def redirect_command(
     words: list[str], redirects: Sequence[Redirect], label: str = "", action: Any = None
 ) -> None:
-    """Add rules to a command line in place, as far as it starts a node of ROS 2.
+    """Add rules to a command line in place, if it starts a node of ROS 2.
 
-    Of what a shell carries out, one plain command is understood, with variables set before it.
+    Of commands for a shell, only a plain one is understood, with variables set before it.
     """
     shell, parts = getattr(action, "shell", False), words
     if shell:
@@ -185,7 +208,10 @@ def redirect_command(
             parts = shlex.split(text) if understood else []
         except ValueError:
             parts = []
-    runs = (one.endswith("ros2") and two == "run" for one, two in itertools.pairwise(parts))
+    runs = (
+        word.endswith("ros2") and following == "run"
+        for word, following in itertools.pairwise(parts)
+    )
     if "--ros-args" not in parts and not any(runs):
         return
     changed = False
@@ -206,31 +232,33 @@ def redirect_command(
 
 
 def _quoted(word: str) -> str:
-    """A word for a shell, for which a variable's name in quotes would be a command."""
-    found = re.match(r"\w+=", word)
-    name = found[0] if found else ""
+    """Return a word for a shell; in quotes, the name of a variable would be a command."""
+    variable = re.match(r"\w+=", word)
+    name = variable[0] if variable else ""
     return name + shlex.quote(word.removeprefix(name))
 
 
 def redirect_request(request: Any, redirects: Sequence[Redirect]) -> list[Redirect]:
-    """Add rules to a request to load a component (`composition_interfaces/srv/LoadNode`).
+    """Add rules to a request to load a component; return the redirects that added some.
 
-    Returns the redirects that added some.
+    The request is a `composition_interfaces/srv/LoadNode`.
     """
-    found, given = [], (request.node_name, request.node_namespace)
+    redirecting_it, given = list[Redirect](), (request.node_name, request.node_namespace)
     for redirect in redirects:
         rules = list(request.remap_rules)
         added = redirect.see(rules, request.plugin_name, given=given)
         for number, rule in reversed(added):
             rules.insert(number, rule)
         request.remap_rules = rules
-        found += [redirect] if added else []
-    return found
+        if added:
+            redirecting_it.append(redirect)
+    return redirecting_it
 
 
 def component_request(component: dict[str, Any], publisher: Any, context: Any) -> Any:
-    """The request to load our component into the container of a publisher, as that was loaded:
-    with or without intra-process communication.
+    """Return the request to load the shaping node into the container of a publisher.
+
+    It has intra-process communication if the publisher was loaded with it.
     """
     from pathlib import Path
 
@@ -240,15 +268,19 @@ def component_request(component: dict[str, Any], publisher: Any, context: Any) -
     request.package_name, request.plugin_name = component["package"], component["plugin"]
     request.node_name, request.node_namespace = component["name"], "/"
     request.remap_rules = [f"{match}:={target}" for match, target in component["remappings"]]
-    found = to_parameters_list(context, component["name"], "/", [Path(component["parameters"])])
-    request.parameters = [one.to_parameter_msg() for one in found]
-    same = (one for one in publisher.extra_arguments if one.name == "use_intra_process_comms")
-    request.extra_arguments = list(same)
+    file = Path(component["parameters"])
+    parameters = to_parameters_list(context, component["name"], "/", [file])
+    request.parameters = [parameter.to_parameter_msg() for parameter in parameters]
+    request.extra_arguments = [
+        argument
+        for argument in publisher.extra_arguments
+        if argument.name == "use_intra_process_comms"
+    ]
     return request
 
 
 def _places(words: Sequence[str]) -> Iterator[int]:
-    """Where the ``-r`` of the remap rules stand among the words of a command line."""
+    """Yield the places of each ``-r`` or ``--remap`` among the words of a command line."""
     for_ros = rule = False
     for place, word in enumerate(words[:-1]):
         for_ros = word == "--ros-args" or (for_ros and word != "--")
@@ -258,9 +290,10 @@ def _places(words: Sequence[str]) -> Iterator[int]:
 
 
 def _of_rule(rules: Sequence[str], *kinds: str) -> str | None:
-    """The name or namespace that rules give to every node of a process."""
-    found = (_RULE.fullmatch(rule) for rule in rules)
-    return next((one[3] for one in found if one and not one[1] and one[2] in kinds), None)
+    """Return the name or namespace that rules give to every node of a process."""
+    matches = (_RULE.fullmatch(rule) for rule in rules)
+    targets = (match[3] for match in matches if match and not match[1] and match[2] in kinds)
+    return next(targets, None)
 
 
 def _names(names: Sequence[str]) -> str:
@@ -273,11 +306,11 @@ def launch_description(
     redirects: Sequence[Redirect],
     environment: Mapping[str, str],
 ) -> Any:
-    """What the launch file beside this module launches: our nodes, and the user's launch files.
+    """Return what the launch file beside this module launches: added nodes, and the user's files.
 
     ``processes`` are keyword arguments of `Node` or `ExecuteProcess`. A library of the
-    ``environment`` is loaded before those that are loaded anyway. Arguments that the files require
-    are declared here too, because launch wants to see them handed on.
+    ``environment`` is loaded before those that are loaded anyway. Arguments that the user's files
+    require are declared here too, because launch asks for them to be handed on.
     """
     from launch import LaunchContext, LaunchDescription, LaunchDescriptionSource, actions
     from launch.launch_description_sources import AnyLaunchDescriptionSource
@@ -297,28 +330,33 @@ def launch_description(
         elif name == "ASAN_OPTIONS":  # the last word counts
             words = [os.environ.get(name, ""), value]
         every.append(actions.SetEnvironmentVariable(name, ":".join(filter(None, words))))
-    every += [(Node if "package" in one else actions.ExecuteProcess)(**one) for one in processes]
+    for process in processes:
+        if "package" in process:
+            every.append(Node(**process))
+        else:
+            every.append(actions.ExecuteProcess(**process))
     for file in files:
         description = AnyLaunchDescriptionSource(file).get_launch_description(LaunchContext())
         declared = description.get_launch_arguments_with_include_launch_description_actions()
         handed_on = []
-        for one, includes in declared:
-            required = one.default_value is None and not one._conditionally_included
+        for argument, includes in declared:
+            required = argument.default_value is None and not argument._conditionally_included
             if includes is None and required:
-                every.append(actions.DeclareLaunchArgument(one.name, description=one.description))
-                handed_on.append((one.name, LaunchConfiguration(one.name)))
+                name, description_of = argument.name, argument.description
+                every.append(actions.DeclareLaunchArgument(name, description=description_of))
+                handed_on.append((name, LaunchConfiguration(name)))
         source = LaunchDescriptionSource(description, file, "spliced launch file")
         every.append(actions.IncludeLaunchDescription(source, launch_arguments=handed_on))
     return LaunchDescription(every)
 
 
 def _begin(context: Any, redirects: Sequence[Redirect]) -> list[Any] | None:
-    """Redirect from here on, and see whether all is right when the application runs."""
+    """Redirect from now on, and check the redirections once the application runs."""
     from launch.actions import OpaqueFunction, TimerAction
     from launch_ros.ros_adapters import get_ros_node
 
     def listen(context: Any) -> None:
-        get_ros_node(context)  # who takes part in ROS 2 for a while knows its graph
+        get_ros_node(context)  # a node that takes part in ROS 2 for a while knows its graph
 
     redirect_from_now_on(redirects)
     if hasattr(context.locals, _DRY_RUN):
@@ -333,7 +371,7 @@ def _begin(context: Any, redirects: Sequence[Redirect]) -> list[Any] | None:
 
 
 def redirect_from_now_on(redirects: Sequence[Redirect]) -> None:
-    """Let whatever this process launches be redirected."""
+    """Redirect everything that this process launches."""
     from launch.descriptions import Executable
     from launch_ros.actions import load_composable_nodes as loading
 
@@ -348,16 +386,21 @@ def redirect_from_now_on(redirects: Sequence[Redirect]) -> None:
 
     def request_redirected(description: Any, context: Any) -> Any:
         request = requested(description, context)
-        if request is not None:  # its condition does not hold
+        if request is not None:  # None: its condition does not hold
             redirected.append((request, redirect_request(request, redirects)))
         return request
 
     def load_with_shaping_node(action: Any, request: Any, context: Any) -> None:
-        own = [redirect for one, found in redirected if one is request for redirect in found]
-        before = [_times_loaded(context, redirect) for redirect in own]
+        of_request = [
+            redirect
+            for seen, redirects_of in redirected
+            if seen is request
+            for redirect in redirects_of
+        ]
+        before = [_times_loaded(context, redirect) for redirect in of_request]
         load(action, request, context)
-        for redirect, times in zip(own, before, strict=True):
-            # One that was given no name may be another node.
+        for redirect, times in zip(of_request, before, strict=True):
+            # A component that the launch does not name may be another node.
             if redirect.component is not None and _times_loaded(context, redirect) > times:
                 load(action, component_request(redirect.component, request, context), context)
                 redirect.loaded = True
@@ -368,15 +411,16 @@ def redirect_from_now_on(redirects: Sequence[Redirect]) -> None:
 
 
 def _times_loaded(context: Any, redirect: Redirect) -> int:
-    """How often launch has seen containers load the publishers of a redirect."""
+    """Return how often launch has seen containers load the publishers of a redirect."""
     from launch_ros.utilities import get_node_name_count
 
     return sum(get_node_name_count(context, node) for node in redirect.nodes)
 
 
 def nodes_of(endpoints: Sequence[Any]) -> tuple[list[str], bool]:
-    """The nodes that publishers or subscriptions belong to, by full name, and whether discovery has
-    yet to say whose some of them are: these are nobody's so far.
+    """Return the full names of the nodes that publishers or subscriptions belong to.
+
+    The second value says whether there are some whose node discovery has not found yet.
     """
     known = [info for info in endpoints if info.node_name != UNKNOWN_NODE]
     names = [f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in known]
@@ -384,8 +428,10 @@ def nodes_of(endpoints: Sequence[Any]) -> tuple[list[str], bool]:
 
 
 def _check(context: Any, redirects: Sequence[Redirect], looks: int = MOST_LOOKS) -> Any:
-    """Compare what was redirected with the graph of ROS 2; a RuntimeError ends the launch. Where
-    discovery has not named all nodes yet, it looks again a second later, ``looks`` times in all.
+    """Compare what was redirected with the graph of ROS 2; a RuntimeError ends the launch.
+
+    Where discovery has not named all nodes yet, it looks again a second later, ``looks`` times in
+    all.
     """
     import launch.logging
     from launch.actions import OpaqueFunction, TimerAction
@@ -393,18 +439,19 @@ def _check(context: Any, redirects: Sequence[Redirect], looks: int = MOST_LOOKS)
 
     logger, asked = launch.logging.get_logger("chainshaper"), get_ros_node(context)
     seen = []
-    for one in redirects:
-        ask = getattr(asked, f"get_{one.kind}s_info_by_topic")
-        seen.append([nodes_of(ask(topic)) for topic in (one.topic, one.target)])
+    for redirect in redirects:
+        ask = getattr(asked, f"get_{redirect.kind}s_info_by_topic")
+        seen.append([nodes_of(ask(topic)) for topic in (redirect.topic, redirect.target)])
     if looks > 1 and any(unknown for both in seen for _, unknown in both):
         again = OpaqueFunction(function=_check, args=[redirects, looks - 1])
         return [TimerAction(period=1.0, actions=[again])]
     messages = []
-    for one, ((on_topic, _), (on_target, _)) in zip(redirects, seen, strict=True):
-        if mistake := one.mistake(on_topic, on_target):
-            messages.append(one.message(mistake, on_topic, on_target))
-        there = "is redirected" if {*one.nodes} <= {*on_target} else "is redirected when it comes"
-        logger.info(f"{one.topic} of {_names(one.nodes)} {there}: {one.target}")
+    for redirect, ((on_topic, _), (on_target, _)) in zip(redirects, seen, strict=True):
+        if mistake := redirect.mistake(on_topic, on_target):
+            messages.append(redirect.message(mistake, on_topic, on_target))
+        all_there = {*redirect.nodes} <= {*on_target}
+        state = "is redirected" if all_there else "is redirected when it comes"
+        logger.info(f"{redirect.topic} of {_names(redirect.nodes)} {state}: {redirect.target}")
     if messages:
         raise RuntimeError("; ".join(messages))
     return None
@@ -417,8 +464,10 @@ def dry_run(
     arguments: dict[str, str],
     folder: str,
 ) -> list[dict[str, Any]]:
-    """Carry out launch files in a folder without starting a process: who would be redirected, and
-    what is wrong with that. Timers fire at once, and what event handlers would start is started.
+    """Carry out launch files in a folder without starting a process.
+
+    Return which nodes would be redirected, and what is wrong with that. Timers fire at once, and
+    everything that event handlers would start counts as started.
     """
     import asyncio
 
@@ -430,16 +479,16 @@ def dry_run(
     from launch_ros.substitutions import ExecutableInPackage
 
     def load(action: Any, context: Any) -> None:
-        for one in action._LoadComposableNodes__composable_node_descriptions:
-            loading.get_composable_node_load_request(one, context)
+        for described in action._LoadComposableNodes__composable_node_descriptions:
+            loading.get_composable_node_load_request(described, context)
 
     def carry_out(entity: Any, context: Any) -> None:
         for inner in entity.visit(context) or ():
             carry_out(inner, context)
 
     ExecuteLocal.execute = lambda action, context: action.prepare(context)
-    ExecutableInPackage.perform = lambda one, context: "".join(
-        context.perform_substitution(part) for part in one.executable
+    ExecutableInPackage.perform = lambda substitution, context: "".join(
+        context.perform_substitution(part) for part in substitution.executable
     )
     LifecycleNode.execute = Node.execute
     LoadComposableNodes.execute = load
@@ -447,7 +496,7 @@ def dry_run(
         timer.execute = lambda action, _: action.actions
     RegisterEventHandler.execute = lambda action, _: action.event_handler.describe()[1]
     os.chdir(folder)
-    parts = [Redirect(**one) for one in redirects]
+    parts = [Redirect(**values) for values in redirects]
     context = LaunchContext()
     context.extend_globals({_DRY_RUN: True})
     context._set_asyncio_loop(asyncio.new_event_loop())
@@ -457,9 +506,9 @@ def dry_run(
         {
             "topic": part.topic,
             "target": part.target,
-            "problem": part.mistake([], [one.node for one in part.started if not one.named]),
+            "problem": part.mistake([], [seen.node for seen in part.started if not seen.named]),
             "redirected": [
-                {"node": one.node, "as": one.label, "rules": one.rules} for one in part.started
+                {"node": seen.node, "as": seen.label, "rules": seen.rules} for seen in part.started
             ],
         }
         for part in parts

@@ -1,5 +1,6 @@
-"""Which outputs are shaped on this machine at the moment, and which go around their shaping node:
-what their pages of memory say (:mod:`chainshaper.robot.handover`).
+"""The outputs that are shaped on this machine at the moment, or go around their shaping node.
+
+Their pages in memory tell (:mod:`chainshaper.robot.handover`).
 """
 
 import os
@@ -36,32 +37,47 @@ _PAGE = re.compile(rf"/(?:chainshaper/outputs|chainshaper-\d+)/[^/]+\.v{VERSION}
 
 @dataclass(frozen=True)
 class ShapedOutput:
-    """An output with a shaping node, as it is now. It counts since the launch of the shaping node
-    began, which may have started that again; ``messages_in_all`` since the machine has booted.
+    """An output with a shaping node, as it is now.
 
-    ``state`` is ``bypassed`` or ``silent`` while no shaping node is in force, and ``no standby``
-    when one is, but nothing would stand in for it: a gate ``in process`` ends with its publisher.
+    Numbers count from the launch of the shaping node on, which may have started it several times.
+
+    * ``topic``: the output.
+    * ``state``: ``shaped``; ``in process``: by a gate that ends with its publisher; ``no standby``:
+      shaped, but the output ends with its shaping node; ``bypassed`` or ``silent`` while no shaping
+      node is in force.
+    * ``shaping_node``, ``standby``: their process ids; None: it is not there.
+    * ``since_ns``: since when it is bypassed or silent (CLOCK_MONOTONIC); None: it is not.
+    * ``messages``: how many messages came since then.
+    * ``messages_in_all``: how many came without a shaping node since the machine has booted.
+    * ``starts``: of the shaping node.
+    * ``published``: messages that shaping nodes published.
+    * ``lost``: messages that were not published, by reason.
+    * ``late``: messages behind the last slot that they were due in, published or lost.
+    * ``moved_ns``: by how much its slots, which follow the latencies, are moved from the plan's.
+    * ``page``: the file of its page.
+    * ``user``: the owner of the page; only this user's outputs can be meant by it.
     """
 
     topic: str
     state: OutputState
-    shaping_node: int | None  # the process, if there is one
+    shaping_node: int | None
     standby: int | None
-    since_ns: int | None  # of CLOCK_MONOTONIC: since when it is bypassed or silent,
-    messages: int  # with how many messages,
-    messages_in_all: int  # beside those before
-    starts: int  # of the shaping node
-    published: int  # by shaping nodes
-    lost: dict[str, int]  # by reason
-    late: int  # of both: behind the last slot that they were due in
-    moved_ns: int  # its slots follow the latencies, and are by so much not where the plan has them
+    since_ns: int | None
+    messages: int
+    messages_in_all: int
+    starts: int
+    published: int
+    lost: dict[str, int]
+    late: int
+    moved_ns: int
     page: str
-    user: int  # whose page it is: nobody else's says anything of this user's outputs
+    user: int
 
 
 def find_outputs(folders: Iterable[str] | None = None) -> tuple[ShapedOutput, ...]:
-    """The outputs that this user may see, root those of all users, and in containers; one whose
-    processes have both ended is none any more.
+    """Return the outputs that this user may see; root sees those of all users, and in containers.
+
+    An output whose shaping node and standby have both ended is not there any more.
     """
     pages: list[tuple[str, str, dict[int, int]]] = []
     if folders is None:
@@ -81,16 +97,16 @@ def find_outputs(folders: Iterable[str] | None = None) -> tuple[ShapedOutput, ..
 
 
 def _in_containers() -> list[tuple[str, str, dict[int, int]]]:
-    """Pages that processes have open whose files are others than ours: folder and name in /proc.
+    """Return pages that processes in other mount namespaces have open, by folder and name in /proc.
 
-    With each are its processes, by what they call themselves: a page has them so.
+    With each are the ids of its processes, by their ids in the container, which the page names.
     """
-    own = Path("/proc/self/ns/mnt").stat().st_ino
+    namespace = Path("/proc/self/ns/mnt").stat().st_ino
     found: dict[tuple[int, int], tuple[str, str, dict[int, int]]] = {}
     for pid in parents():
         folder = f"/proc/{pid}/fd"
         with suppress(OSError):  # it has ended, or is another user's
-            if os.stat(f"/proc/{pid}/ns/mnt").st_ino == own:  # noqa: PTH116
+            if os.stat(f"/proc/{pid}/ns/mnt").st_ino == namespace:  # noqa: PTH116
                 continue
             inner = innermost_id(read_proc(f"/proc/{pid}/status")) or pid
             for name in os.listdir(folder):  # noqa: PTH208
@@ -102,10 +118,10 @@ def _in_containers() -> list[tuple[str, str, dict[int, int]]]:
 
 
 def remove_abandoned_pages(folders: Iterable[str] | None = None) -> list[str]:
-    """Remove the pages of this user's outputs that no process has open: the files removed.
+    """Remove the pages of this user's outputs that no process has open; return their files.
 
-    One with a right taken stays as well: its process may be in a container, and not to be seen. A
-    node that looks for its page meanwhile finds that it is gone, and makes another.
+    A page with a right taken stays: its process may be in a container, and not visible here. A node
+    whose page was removed finds that out and makes another.
     """
     opened, removed = _opened_pages(), list[str]()
     for folder in page_folders() if folders is None else folders:
@@ -124,7 +140,7 @@ def remove_abandoned_pages(folders: Iterable[str] | None = None) -> list[str]:
 
 
 def _has_rights(folder: str, name: str) -> bool:
-    """Whether a process has a right of a page; of one for which there was no room, none has."""
+    """Return whether a process has a right of a page; nobody has one of a page without content."""
     try:
         with closing(Page(folder, name)) as page:
             return any(map(page.is_locked, (PUBLISHING, STANDING_BY, PASSING, MOVING)))
@@ -133,12 +149,14 @@ def _has_rights(folder: str, name: str) -> bool:
 
 
 def _opened_pages() -> set[tuple[int, int]]:
-    """Device and number of each page that another process has open, as far as they are seen."""
+    """Return device and inode of each page that a process has open which this user may see."""
     opened = set[tuple[int, int]]()
     for pid in parents():
         folder = f"/proc/{pid}/fd"
         with suppress(OSError):  # it has ended, or is another user's
-            for name in os.listdir(folder) if pid != os.getpid() else ():  # noqa: PTH208
+            if pid == os.getpid():
+                continue
+            for name in os.listdir(folder):  # noqa: PTH208
                 with suppress(OSError):
                     if _PAGE.search(os.readlink(f"{folder}/{name}")):  # noqa: PTH115
                         file = os.stat(f"{folder}/{name}")  # noqa: PTH116
@@ -147,7 +165,7 @@ def _opened_pages() -> set[tuple[int, int]]:
 
 
 def output_text(output: ShapedOutput) -> str:
-    """The state of an output in a line, with what the gate has counted."""
+    """Return the state of an output in a line, with what the gate has counted."""
     topic = output.topic
     if output.user not in run_users():  # any user may have a page that names any topic
         topic = f"{topic} of user {user_name(output.user)}"
@@ -172,7 +190,7 @@ def output_text(output: ShapedOutput) -> str:
 
 
 def ask_phase(topic: str, pids: Collection[int], phase_ns: int) -> None:
-    """Have the cycles of a gate in its publisher's process begin elsewhere (ns of CLOCK_MONOTONIC).
+    """Ask a gate in its publisher's process to start cycles at another phase (CLOCK_MONOTONIC, ns).
 
     Raises OperationError: none of these processes publishes the output, or several do.
     """
@@ -182,7 +200,10 @@ def ask_phase(topic: str, pids: Collection[int], phase_ns: int) -> None:
 
 
 def _page_of(topic: str, pids: Collection[int]) -> Page:
-    """The page of an output that one of these processes publishes; of any of ours, without them."""
+    """Open the page of an output that one of these processes publishes.
+
+    Without processes it is one of this user's.
+    """
     of_topic = [output for output in find_outputs() if output.topic == topic]
     found = [
         output
@@ -208,7 +229,7 @@ class FollowedOutput:
 
     def __init__(self, topic: str, pids: Collection[int] = ()) -> None:
         self._page = _page_of(topic, pids)
-        if not self._page.is_locked(MOVING):  # by how much a run before moved them is over
+        if not self._page.is_locked(MOVING):  # a run before moved the slots, and has ended
             self._page["moved_from_ns"] = 0
         if not self._page.lock(MOVING):
             self._page.close()
@@ -219,7 +240,7 @@ class FollowedOutput:
         self.move(0, time.monotonic_ns())
 
     def latencies(self) -> list[int]:
-        """Those of the outputs that came since the last time, from origin to arrival (ns).
+        """Return the latencies of outputs since the last call, from origin to arrival (ns).
 
         Raises OperationError: the gate's page is not there any more.
         """
@@ -234,24 +255,28 @@ class FollowedOutput:
         return new
 
     def move(self, by_ns: int, from_ns: int) -> None:
-        """Have slots be by so much not where the gate has them, in cycles from an instant on."""
+        """Move slots by this time from where the gate has them, in cycles from an instant on."""
         self._page["moved_from_ns"] = 0
         self._page["moved_ns"] = by_ns
         self._page["moved_from_ns"] = from_ns
 
     def close(self) -> None:
-        """The slots go back to where the gate has them."""
+        """Let the slots go back to where the gate has them."""
         self._page.close()
 
 
 def _is_of(pid: int, user: int) -> bool:
-    """Whether a process has that real user: any user may write its id into a page."""
+    """Return whether a process has this real user: any user may write any id into a page."""
     with suppress(OSError):
         return status_field(read_proc(f"/proc/{pid}/status"), "Uid")[:1] == [user]
     return False
 
 
 def _looked_at(page: Page, pid_of: Mapping[int, int]) -> list[ShapedOutput]:
+    """Return the output of a page; none: its processes have ended.
+
+    ``pid_of`` has the process ids here by those that the page names.
+    """
     holder = page["holder"] if page.is_locked() else 0
     standby = page["standby"] if page.is_locked(STANDING_BY) else 0
     holder, standby = pid_of.get(holder, holder), pid_of.get(standby, standby)
@@ -268,7 +293,7 @@ def _looked_at(page: Page, pid_of: Mapping[int, int]) -> list[ShapedOutput]:
     counts = {why: page[why.replace(" ", "_").lower()] for why in (*DROPPED, "lost by DDS")}
     return [
         ShapedOutput(
-            topic=_TOPIC.validate_python(page.topic),  # another user's: no text of any other form
+            topic=_TOPIC.validate_python(page.topic),  # another user may write any text
             state=state,
             shaping_node=holder or None,
             standby=standby or None,

@@ -25,20 +25,27 @@ from chainshaper.values.plan_choices import STANDBY, NodeLanguage
 
 @dataclass(frozen=True)
 class ShapingProcess:
-    """A process that a launch file starts, again when it ends: a shaping node, or a throttler.
+    """A shaping node or a throttler, which a launch file starts, and starts again when it ends.
 
-    It is either a ``command`` (without ``--ros-args``) or an ``executable`` of a ``package``; with
-    ``plugin`` a component of it, which is loaded into the publisher's container and ends with that.
+    * ``name``: of the node.
+    * ``command``: what to start, without ``--ros-args``; None: an ``executable`` of a ``package``.
+    * ``package``: the package in C++; None: the node is in Python.
+    * ``executable``: in the package; None: a component, or in Python.
+    * ``parameters_file``: of ROS 2.
+    * ``remappings``: such as ``("input", "/t5_tmp")``.
+    * ``plugin``: the component in the package, which the container of the publisher loads, and
+      which ends with that; None: a process of its own.
+    * ``standby``: what publishes the output while this process is not there.
     """
 
     name: str
     command: tuple[str, ...] | None
     package: str | None
     executable: str | None
-    parameters_file: Path  # of ROS 2
-    remappings: tuple[tuple[str, str], ...] = ()  # such as ("input", "/t5_tmp")
+    parameters_file: Path
+    remappings: tuple[tuple[str, str], ...] = ()
     plugin: str | None = None
-    standby: "ShapingProcess | None" = None  # passes its output on meanwhile
+    standby: "ShapingProcess | None" = None
 
     @property
     def command_line(self) -> list[str]:
@@ -51,21 +58,31 @@ class ShapingProcess:
     @property
     def action(self) -> dict[str, Any]:
         """The arguments of launch's `ExecuteProcess`, or of `Node`."""
-        # It may end at once each time: without a delay (s) that takes a core.
+        # A process that ends at once each time would take a core without a delay (s).
         common = {"name": self.name, "output": "screen", "respawn": True, "respawn_delay": 0.1}
         if self.command is not None:
             return {"cmd": self.command_line, **common}
-        own = {"package": self.package, "executable": self.executable, "namespace": "/"}
-        parameters = {"parameters": [str(self.parameters_file)]}
-        return {**own, **parameters, "remappings": [*self.remappings], **common}
+        return {
+            "package": self.package,
+            "executable": self.executable,
+            "namespace": "/",
+            "parameters": [str(self.parameters_file)],
+            "remappings": [*self.remappings],
+            **common,
+        }
 
     @property
     def component(self) -> dict[str, Any] | None:
-        """What is needed to have a container load it (`redirection.component_request`)."""
+        """What a container has to load (`redirection.component_request`); None: no component."""
         if self.plugin is None:
             return None
-        own = {"package": self.package, "plugin": self.plugin, "name": self.name}
-        return {**own, "remappings": self.remappings, "parameters": str(self.parameters_file)}
+        return {
+            "package": self.package,
+            "plugin": self.plugin,
+            "name": self.name,
+            "remappings": self.remappings,
+            "parameters": str(self.parameters_file),
+        }
 
 
 def write_shaping_process(
@@ -78,13 +95,15 @@ def write_shaping_process(
     log: Path | None = None,
     into: Path | None = None,
 ) -> ShapingProcess:
-    """Write a shaping node of a plan into ``folder``; what a launch file has to start.
+    """Write a shaping node of a plan into ``folder``; return what a launch file has to start.
 
-    ``message_type`` is the output's, such as ``sensor_msgs/msg/Image``, for which ``typed``
-    and ``component`` are generated. ``log`` is where the node notes what it did with each message.
-    Files that are to be moved to ``folder`` later are written ``into`` another one. Raises
-    InputError: a file is there with another content; no type for a kind that needs one, or none
-    that there is. OperationError: a file cannot be written.
+    * ``message_type``: the output's, such as ``sensor_msgs/msg/Image``, which the kinds ``typed``
+      and ``component`` need.
+    * ``log``: the file in which the node notes what it did with each message.
+    * ``into``: the folder to write into, if the files are moved to ``folder`` later.
+
+    Raises InputError: a file is there with another content; a kind needs a type, and none is given,
+    or there is no such type. OperationError: a file cannot be written.
     """
     if kind in OF_ONE_TYPE and message_type is None:
         raise InputError(
@@ -95,15 +114,14 @@ def write_shaping_process(
     parameters = shaping_parameters(plan, node, log) | {"handover": page_name(node, log or folder)}
     shaped = message_type_named(message_type) if kind in OF_ONE_TYPE and message_type else None
     process, files = _process(kind, "shaping_node", node.name, folder, parameters, topics, shaped)
-    if process.plugin is None:  # that ends with its publisher, and a standby would cost a copy
+    # A component ends with its publisher, and its standby would cost a copy of each message.
+    if process.plugin is None:
         name = f"{node.name}{STANDBY}"
         same = {key: parameters[key] for key in ("handover", "output_depth", "depth")}
         of_standby = same | {
             "shaping_node": node.name,
             "fallback": plan.fallback,
-            # A node later than that hangs; in its server's slots only, it may be a cycle later.
-            "patience_ns": max(plan.cycle_ns // 2, 10_000_000)
-            + (plan.cycle_ns if plan.shaping_thread == "in-slots" else 0),
+            "patience_ns": _patience_ns(plan),
             "server_cores": sorted({server.core for server in plan.servers}),
             "log": "" if log is None else str(log.with_stem(name).absolute()),
         }
@@ -111,6 +129,14 @@ def write_shaping_process(
         process, files = replace(process, standby=standby), files | others
     _write(into or folder, files)
     return process
+
+
+def _patience_ns(plan: ChainPlan) -> int:
+    """Return how late a shaping node is for a release if it hangs (ns)."""
+    patience_ns = max(plan.cycle_ns // 2, 10_000_000)
+    if plan.shaping_thread == "in-slots":  # its thread may have to wait for the next slot
+        patience_ns += plan.cycle_ns
+    return patience_ns
 
 
 def write_throttler(
@@ -127,13 +153,16 @@ def write_throttler(
     depth: int = DEPTH,
     into: Path | None = None,
 ) -> ShapingProcess:
-    """Write a throttler into ``folder`` (paper, section 5.1); what a launch file has to start.
+    """Write a throttler into ``folder`` (paper, section 5.1); return what a launch file starts.
 
-    Each of the ``topics`` is republished on the one it maps to, once every ``period_ns``: by the
-    ``rule`` ``newest`` at ``phase_ns`` after multiples of it on CLOCK_MONOTONIC, by ``first`` as it
-    comes. ``depth`` is the history of the publishers where that of the originals is not known;
-    ``into``, and errors, as for a shaping process; InputError also: no topics or period, or
-    ``first`` with a phase.
+    * ``topics``: each one is republished on the one it maps to.
+    * ``period_ns``: once in each period.
+    * ``rule``: ``newest`` publishes at ``phase_ns`` behind multiples of the period on
+      CLOCK_MONOTONIC; ``first`` as messages come.
+    * ``depth``: the history of the publishers, where that of the original ones is not known.
+    * ``into``: as for :func:`write_shaping_process`.
+
+    Raises the errors of that, and InputError: no topics or period, or ``first`` with a phase.
     """
     if not topics or period_ns <= 0:
         raise InputError("a throttler needs topics and a period longer than nothing")
@@ -164,7 +193,7 @@ def _process(  # noqa: PLR0917 - all of a process
     remappings: tuple[tuple[str, str], ...] = (),
     shaped: MessageType | None = None,
 ) -> tuple[ShapingProcess, dict[str, str]]:
-    """A process with its files, by their paths below the folder."""
+    """Return a process, and the text of its files by their paths below the folder."""
     file, plugin = folder.absolute() / f"{name}.yaml", None
     if kind == "component":  # a list without elements has no type
         parameters = {key: value for key, value in parameters.items() if value != []}
@@ -173,7 +202,7 @@ def _process(  # noqa: PLR0917 - all of a process
     files = {file.name: text}
     if kind == "python":
         files[f"{name}.py"] = python_node(executable)
-        if executable != "standby":  # that stands beside one that has it
+        if executable != "standby":  # the node that it stands beside brings this file
             files["respawning.py"] = RESPAWNING.read_text(encoding="utf-8")
         command = ("python3", str(file.with_suffix(".py")))
         return ShapingProcess(name, command, None, None, file, remappings), files
@@ -187,7 +216,7 @@ def _process(  # noqa: PLR0917 - all of a process
 
 
 def _write(folder: Path, files: dict[str, str]) -> None:
-    """Write files beside and rename them, once all that are there already were looked at."""
+    """Write files, each whole or not at all, unless one is there with another content."""
     try:
         for name, text in files.items():
             path = folder / name

@@ -1,8 +1,9 @@
-"""A folder with the launch file that splicing writes: whole or absent, and known as ours.
+"""The folder with the launch file that splicing writes.
 
-Beside the launch file stand what redirects topics (:mod:`.redirection`) and the nodes that are
-added. A manifest, `splice.json`, names every file with its hash, so that the folder can be replaced
-or removed again as long as it is unchanged, but for what running and building leave there.
+It is written whole or not at all. Beside the launch file are the module that redirects topics
+(:mod:`.redirection`) and the nodes that are added. A manifest, `splice.json`, names every file with
+its hash, so that `splice` can replace or remove the folder while nothing in it was changed; files
+that running and building leave there do not count.
 """
 
 import hashlib
@@ -32,7 +33,7 @@ LOGS = "logs"
 _FORMAT = 1
 _DERIVED = {LOGS, *(f"{NODES}/{name}" for name in ("build", "install", "log"))}
 _WITH_VALUE = ("--launch-prefix", "--launch-prefix-filter", "--prefix")
-_SIGNS = {  # a mistaken file lacks this, by the end of its name; launch alone reads it
+_SIGNS = {  # what a launch file has in it, by the end of its name; only launch reads it in full
     ".py": "generate_launch_description",
     ".xml": "<launch",
     **dict.fromkeys((".yaml", ".yml"), r"(?m)^[\s'\"{]*launch\b"),
@@ -57,7 +58,7 @@ def generate_launch_description():
     spec = importlib.util.spec_from_file_location("redirection", path)
     redirection = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(redirection)
-    redirects = [redirection.Redirect(**one) for one in REDIRECTS]
+    redirects = [redirection.Redirect(**values) for values in REDIRECTS]
     return redirection.launch_description(LAUNCH_FILES, PROCESSES, redirects, ENVIRONMENT)
 '''
 
@@ -66,12 +67,12 @@ def generate_launch_description():
 class LaunchCommand:
     """`ros2 launch …` as it was typed."""
 
-    before: tuple[str, ...]  # the words before those that name the launch file
+    before: tuple[str, ...]  # the words before the launch file, or its package and name
     file: Path
     after: tuple[str, ...]
 
     def with_file(self, file: Path) -> list[str]:
-        """The command that launches another file in the same way."""
+        """Return the command that launches another file in the same way."""
         return [*self.before, str(file), *self.after]
 
 
@@ -98,7 +99,7 @@ def parse_launch_command(command: Sequence[str]) -> LaunchCommand:
 
 
 def _behind_options(words: Sequence[str]) -> int:
-    """The place of the first word behind `ros2 launch`, or `ros2 run`, and its options."""
+    """Return the place of the first word behind `ros2 launch`, or `ros2 run`, and its options."""
     at = 2
     while at < len(words) and words[at].startswith("-"):
         at += 2 if words[at] in _WITH_VALUE else 1
@@ -106,11 +107,11 @@ def _behind_options(words: Sequence[str]) -> int:
 
 
 def _file_of_package(package: str, name: str) -> Path:
-    """A launch file anywhere in a package's share folder, which is found as `ament_index` does."""
+    """Return a launch file anywhere in a package's share folder (found as by `ament_index`)."""
     prefixes = filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep))
     shares = [Path(prefix) / "share" for prefix in prefixes]
     index = Path("ament_index/resource_index/packages", package)
-    share = next((one / package for one in shares if (one / index).is_file()), None)
+    share = next((folder / package for folder in shares if (folder / index).is_file()), None)
     if share is None:
         raise InputError(
             f"{package}: neither a launch file nor a package of this environment; is it sourced "
@@ -130,7 +131,7 @@ def _file_of_package(package: str, name: str) -> Path:
 
 
 def launch_file_name(words: Sequence[str]) -> str:
-    """The name of the launch file that stands for others, or for `ros2 run …`."""
+    """Return the name of the launch file that stands for others, or for `ros2 run …`."""
     name = executable_of(words) or Path(words[0]).name
     return re.sub(r"([.]launch)?([.](py|xml|ya?ml|launch))?$", "", name, count=1) + ".launch.py"
 
@@ -141,30 +142,38 @@ def launch_text(
     redirects: Sequence[Redirect],
     environment: Mapping[str, str],
 ) -> str:
-    """The text of the launch file that starts processes and includes launch files.
+    """Return the text of the launch file that starts processes and includes launch files.
 
-    ``words`` are the files, or `ros2 run …`; what is launched gets the ``environment`` as well.
+    ``words`` are the files, or `ros2 run …`; everything launched gets the ``environment`` as well.
     """
-    run = [{"cmd": [*words], "output": "screen"}] if is_run(words) else []
-    every = [one for process in processes for one in (process, process.standby)]
-    actions = [one.action for one in every if one is not None and one.plugin is None]
+    files, actions = list(words), list[dict[str, Any]]()
+    for process in processes:
+        if process.plugin is None:
+            actions.append(process.action)
+        if process.standby is not None:
+            actions.append(process.standby.action)
+    if is_run(words):
+        files = []
+        actions.append({"cmd": [*words], "output": "screen"})
     what = executable_of(words) or ", ".join(Path(word).name for word in words)
     return _TEXT.format(
-        what=re.sub(r"[^\w., -]", "_", what),  # a file's name cannot end the text it stands in
-        files=pformat([] if run else list(words), width=96),
-        processes=pformat([*actions, *run], width=96, sort_dicts=False),
-        redirects=pformat([one.values() for one in redirects], width=96, sort_dicts=False),
+        what=re.sub(r"[^\w., -]", "_", what),  # so a file's name cannot end the docstring
+        files=pformat(files, width=96),
+        processes=pformat(actions, width=96, sort_dicts=False),
+        redirects=pformat(
+            [redirect.values() for redirect in redirects], width=96, sort_dicts=False
+        ),
         environment=pformat(dict(environment), width=96, sort_dicts=False),
     )
 
 
 def is_run(words: Sequence[str]) -> bool:
-    """Whether words are `ros2 run PACKAGE EXECUTABLE …` in place of launch files."""
+    """Return whether words are `ros2 run PACKAGE EXECUTABLE …` in place of launch files."""
     return executable_of(words) is not None
 
 
 def executable_of(words: Sequence[str]) -> str | None:
-    """The name of what `ros2 run [--prefix PREFIX] PACKAGE EXECUTABLE …` starts; None: it is none.
+    """Return the executable of `ros2 run [--prefix PREFIX] PACKAGE EXECUTABLE …`; None: it is none.
 
     Upstream: ros2run, `command/run.py`.
     """
@@ -175,10 +184,10 @@ def executable_of(words: Sequence[str]) -> str | None:
 
 
 def original_words(words: Sequence[str], *, throttled: bool = False) -> list[str]:
-    """Launch files as they were before splicing, each once, or `ros2 run …` as it is.
+    """Return the launch files before splicing, each once, or `ros2 run …` as it is.
 
-    With ``throttled`` a launch file that has a throttler is an original too. Raises InputError: one
-    of them is not there, or is no launch file, or stands for `ros2 run …` beside others.
+    With ``throttled`` a launch file that has a throttler is an original too. Raises InputError: a
+    file is not there, or is no launch file, or stands for `ros2 run …` beside other files.
     """
     if is_run(words):
         return list(words)
@@ -211,9 +220,9 @@ def original_words(words: Sequence[str], *, throttled: bool = False) -> list[str
 
 
 def usable(folder: Path) -> Path:
-    """The absolute path of the folder to write, once it is sure that nothing would be lost.
+    """Return the absolute path of the folder to write, after a check that nothing would be lost.
 
-    Raises InputError: it has something in it that is not ours, or was changed.
+    Raises InputError: something in it was not written by `splice`, or was changed.
     """
     folder = folder.absolute()
     if not folder.parent.is_dir():
@@ -239,8 +248,11 @@ def _refuse_changed(folder: Path, consequence: str) -> None:
 
 
 def _manifest(folder: Path) -> dict[str, Any] | None:
-    """What was written: ``copies`` (launch files of ours, with the words that they stand for),
-    ``files`` (SHA-256 by name), and whether it has a throttler.
+    """Return the manifest of a folder; None: it has none.
+
+    * ``copies``: the launch files that were written, with the words that they stand for.
+    * ``files``: the SHA-256 of each file by its name.
+    * ``throttled``: whether it has a throttler.
     """
     try:
         values = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
@@ -254,7 +266,7 @@ def _manifest(folder: Path) -> dict[str, Any] | None:
 
 
 def _hashes(folder: Path) -> dict[str, str]:
-    """The hash of every file that counts, by its path below the folder."""
+    """Return the hash of every file that counts, by its path below the folder."""
     found: dict[str, str] = {}
     for path in folder.rglob("*"):
         name = path.relative_to(folder)
@@ -268,10 +280,10 @@ def _hashes(folder: Path) -> dict[str, str]:
 def new_folder(
     folder: Path, copies: Mapping[str, Sequence[str]], *, throttled: bool = False
 ) -> Iterator[Path]:
-    """A folder to fill, which takes the place of ``folder`` when all went well.
+    """Give a folder to fill, which takes the place of ``folder`` if nothing failed.
 
     ``copies`` are the launch files in it, with the words that they stand for. Raises
-    OperationError: it cannot be written; nothing is left behind, an older one stays.
+    OperationError: it cannot be written; nothing is left behind, and an older folder stays.
     """
     try:
         with folder_beside(folder) as made:
@@ -290,11 +302,11 @@ def new_folder(
 
 
 def _replace(folder: Path, new: Path) -> None:
-    """Put a new folder in the place of an older one of ours, which comes back if that fails."""
+    """Put a new folder in the place of an older one, which comes back if that fails."""
     if not folder.exists():
         rename_output(new, folder)
         return
-    with claimed(folder):  # of a killed run, `chainshaper release` removes it
+    with claimed(folder):  # `chainshaper release` removes what a killed run leaves
         aside = _moved_aside(folder)
         try:
             rename_output(new, folder)
@@ -310,9 +322,9 @@ def _moved_aside(folder: Path) -> Path:
 
 
 def undo_splice(folder: str | Path) -> None:
-    """Remove what splicing wrote, all of it or nothing.
+    """Remove the folder that splicing wrote, whole or not at all.
 
-    Raises InputError: it is not ours, or something in it was changed or added since.
+    Raises InputError: `splice` did not write it, or something in it was changed or added since.
     OperationError: it cannot be removed.
     """
     folder = Path(folder).absolute()

@@ -16,14 +16,14 @@ The live workload executes it with real processes over DDS, the simulator as dis
 
 import re
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import MISSING, fields, replace
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_args, get_origin
 
-from pydantic import Field, model_validator
+from pydantic import Field, create_model, model_validator
 
-from chainshaper.robot.gate import Anchor, Gate, IntoOpenSlot, Late, Messages, Modes, Overrun
+from chainshaper.robot.gate import AtLeast, Gate, Late, Modes
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Publication
 from chainshaper.values.yaml_file import (
@@ -127,24 +127,47 @@ class ModesDescription(Part):
     late: Late = "wait"
 
 
-class GateDescription(Part):
+def _gate_fields() -> dict[str, Any]:
+    """Return the fields of a gate's description, from those that ``Gate`` declares."""
+    described: dict[str, Any] = {}
+    for declared in fields(Gate):
+        limits = get_args(declared.type)
+        least = next((limit.number for limit in limits if isinstance(limit, AtLeast)), None)
+        type_: Any = Any  # slots and modes: `GateDescription` has types of its own for them
+        if get_origin(declared.type) is Literal:
+            type_ = declared.type
+        elif declared.name.endswith("_ns"):
+            type_ = PositiveDuration if least == 1 else Duration
+        elif least is not None:
+            type_ = Annotated[int, Field(ge=least)]
+        default = ... if declared.default is MISSING else declared.default
+        described[declared.name] = (type_, default)
+    return described
+
+
+if TYPE_CHECKING:
+    _DescribedGate = Part
+else:
+    _DescribedGate = create_model("_DescribedGate", __base__=Part, **_gate_fields())
+
+
+class GateDescription(_DescribedGate):
     """A :class:`~chainshaper.robot.gate.Gate` in a callback: republishing in ``slots`` only.
 
-    ``phase_ns`` is where cycles begin without a stamp, behind the common start (None: with the
-    timer that starts the application's chain). ``moves``: from when on after that start, and where
-    the first slot begins then; the others move with it.
+    It has the fields of a gate under their names, times as durations, and:
+
+    * ``phase_ns``: where cycles begin without a stamp, behind the common start; None: with the
+      timer that starts the application's chain.
+    * ``modes``: with the topic that announces them.
+    * ``moves``: from when on, behind the common start, and where the first slot begins then; the
+      others move with it.
+    * ``spin_ns``: for so long before a release the thread watches the clock.
+    * ``pause_ns``: for so long behind a publication the thread rests.
     """
 
     slots: Annotated[tuple[Pair, ...], Field(min_length=1)]
-    cycle_ns: PositiveDuration
-    anchor: Anchor = "stamp"
-    overrun: Overrun = "wait"
-    due_cycles: Annotated[int, Field(ge=0)] = 0
     phase_ns: Duration | None = None
     modes: ModesDescription | None = None
-    messages: Messages = "all-in-order"
-    depth: Annotated[int, Field(ge=1)] = 10
-    into_open_slot: IntoOpenSlot = "at-once"
     moves: tuple[Pair, ...] = ()
     spin_ns: Duration = 0
     pause_ns: Duration = 0
@@ -153,10 +176,9 @@ class GateDescription(Part):
     def _gate_exists(self) -> "GateDescription":
         key = "slots"
         try:
-            gate = Gate(slots=self.slots, cycle_ns=self.cycle_ns)
+            gate = self._without_modes()
             key = "modes"
-            if (own := self.modes) is not None:
-                replace(gate, modes=Modes(own.bands, own.default, own.late))
+            gate = self.gate()
         except ValueError as error:
             raise wrong_value(str(error), key) from error
         before = -1
@@ -169,9 +191,20 @@ class GateDescription(Part):
                 raise wrong_value(reason, "moves", number)
             before = since
         for key, rest in (("spin", self.spin_ns), ("pause", self.pause_ns)):
-            if rest >= self.cycle_ns:
+            if rest >= gate.cycle_ns:
                 raise wrong_value("must be shorter than the cycle: shorten it", key)
         return self
+
+    def gate(self) -> Gate:
+        """Return the gate that is described; its ``phase_ns`` counts from the common start."""
+        gate, modes = self._without_modes(), self.modes
+        if modes is None:
+            return gate
+        return replace(gate, modes=Modes(modes.bands, modes.default, modes.late))
+
+    def _without_modes(self) -> Gate:
+        values = {declared.name: getattr(self, declared.name) for declared in fields(Gate)}
+        return Gate(**values | {"phase_ns": self.phase_ns or 0, "modes": None})
 
     def moved(self, start_ns: int) -> list[tuple[int, int]]:
         """The moves as a :class:`~chainshaper.robot.waiting.Queue` has them."""

@@ -2,10 +2,9 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from chainshaper.robot.clear_core import ClearCore
-from chainshaper.robot.gate import Gate, Modes
 from chainshaper.robot.handover import Turn
 from chainshaper.robot.shaper import STALL_NS, Shaper
 from chainshaper.robot.waiting import Outcome
@@ -20,22 +19,7 @@ def shaper_of(
 ) -> Shaper:
     """The shaper of a described gate; its phase and moves count from the run's start."""
     phase_ns = origin_phase_ns if gate.phase_ns is None else gate.phase_ns
-    modes = gate.modes
-    shaper = Shaper(
-        Gate(
-            slots=gate.slots,
-            cycle_ns=gate.cycle_ns,
-            anchor=gate.anchor,
-            phase_ns=phase_ns,
-            overrun=gate.overrun,
-            due_cycles=gate.due_cycles,
-            modes=None if modes is None else Modes(modes.bands, modes.default, modes.late),
-            messages=gate.messages,
-            depth=gate.depth,
-            into_open_slot=gate.into_open_slot,
-        ),
-        gate.spin_ns,
-    )
+    shaper = Shaper(replace(gate.gate(), phase_ns=phase_ns), gate.spin_ns)
     if delivery_core is not None:
         clear_until = ClearCore(delivery_core).clear_until
         shaper.on_waking = lambda release_ns: clear_until(release_ns + gate.pause_ns)

@@ -41,7 +41,7 @@ def timing_of(application: Application, cycles: int, start_ns: int) -> Timing:
     end_ns = first_ns + cycles * period_ns
     before_ns = min(1_000_000, period_ns // 10)
     gates = (cb.gate for _, cb in application.callbacks() if cb.gate is not None)
-    due_cycles = max((gate.due_cycles for gate in gates), default=0)
+    due_cycles = max((gate.gate().due_cycles for gate in gates), default=0)
     return Timing(
         start_ns=start_ns,
         anchor_ns=anchor_ns,

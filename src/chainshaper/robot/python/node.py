@@ -32,7 +32,7 @@ from rclpy.utilities import get_rmw_implementation_identifier
 from chainshaper.robot.clear_core import started_beside
 from chainshaper.robot.gate import DEPTH
 from chainshaper.robot.gate_log import LOG_COLUMNS
-from chainshaper.robot.node_parameters import NodeParameters
+from chainshaper.robot.node_parameters import PARAMETERS, NodeParameters, parameters_from
 from chainshaper.robot.shaper import READER_DEPTH
 from chainshaper.robot.waiting import Outcome
 
@@ -41,12 +41,13 @@ HUMBLE = not hasattr(Subscription, "CallbackType")
 
 
 def parameters_of(node: Node) -> NodeParameters:
-    """What the parameter file says, and the rest as usual."""
-    known = {
-        name: node.get_parameter_or(name, Parameter(name, value=usual)).value
-        for name, usual in vars(NodeParameters()).items()
-    }
-    return NodeParameters(**known)
+    """Return what the parameter file says, and defaults for the rest."""
+    return parameters_from(
+        {
+            name: node.get_parameter_or(name, Parameter(name, value=default)).value
+            for name, (_, default) in PARAMETERS.items()
+        }
+    )
 
 
 def delivery_core(taken: list[int]) -> int | None:

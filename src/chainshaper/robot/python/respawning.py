@@ -16,25 +16,30 @@ from pathlib import Path
 
 
 def main() -> int:
-    """Run the program of the command line until this process is to end; the last exit code."""
+    """Run the program of the command line until this process is asked to end.
+
+    Return the last exit code of the program.
+    """
     beside = Path(__file__).parent / sys.argv[1]
     program = str(beside) if beside.exists() else sys.argv[1]
-    command = [*([sys.executable] if program.endswith(".py") else []), program, *sys.argv[2:]]
-    asked: list[int] = []
+    command = [program, *sys.argv[2:]]
+    if program.endswith(".py"):
+        command.insert(0, sys.executable)
+    received: list[int] = []  # signals
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: asked.append(number))
+        signal.signal(number, lambda number, _: received.append(number))
     while True:
         child, handed_on = subprocess.Popen(command), 0
         while child.poll() is None:
-            for one in asked[handed_on:]:
-                child.send_signal(one)
+            for signal_number in received[handed_on:]:
+                child.send_signal(signal_number)
                 handed_on += 1
             with suppress(subprocess.TimeoutExpired):
                 child.wait(0.05)
-        if asked:
+        if received:
             return child.returncode
         sys.stderr.write(f"{sys.argv[1]} ended with code {child.returncode}: it is started again\n")
-        time.sleep(0.1)  # it may end at once each time
+        time.sleep(0.1)  # a program that ends at once each time leaves the core to others
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""The standby: passes an output on while its shaping node is not there.
+"""The standby: it publishes an output while the shaping node is not there.
 
-It publishes what the shaping node receives on the same output, byte for byte and at once, while
-no shaping node is in force (:mod:`chainshaper.robot.handover`). With the fallback ``silence`` it
-only counts what does not come. Either way it says so: in a log like the gate's, by a warning, and
-on `/diagnostics` where diagnostic_msgs is installed. It runs in the ordinary class.
+While no shaping node is in force (:mod:`chainshaper.robot.handover`), the standby publishes what
+that node would receive, on the same output, byte for byte and at once. With the fallback
+``silence`` it only counts these messages. Either way it reports them: in a log like the gate's, by
+a warning, and on `/diagnostics` where diagnostic_msgs is installed. It has no real-time priority.
 """
 
 import importlib
@@ -34,7 +34,7 @@ from chainshaper.robot.waiting import Outcome, Waiting
 
 
 def watch(node: Node, standby: Standby) -> None:
-    """Look after the shaping node; a standby that cannot is of no use, and is started again."""
+    """Watch the shaping node; end the process if that fails: the launch starts it again."""
     try:
         standby.watch()
     except BaseException as error:
@@ -73,12 +73,13 @@ def diagnostics_of(node: Node, standby: Standby, shaping_node: str) -> None:
 
 
 def set_up(node: Node) -> Callable[[], bool]:
-    """Make the node's endpoints, and begin to watch."""
+    """Make the node's endpoints, and start to watch the shaping node."""
     parameters = parameters_of(node)
     ours = os.sched_getaffinity(0) - set(parameters.server_cores)
-    for thread in Path("/proc/self/task").iterdir() if ours else ():  # servers have the others
-        with suppress(OSError):
-            os.sched_setaffinity(int(thread.name), ours)
+    if ours:  # servers have the other cores
+        for thread in Path("/proc/self/task").iterdir():
+            with suppress(OSError):
+                os.sched_setaffinity(int(thread.name), ours)
     silent, shaping_node = parameters.fallback == "silence", parameters.shaping_node
     log, logger = GateLog(node), node.get_logger()
     info = wait_for_publisher(node, "input")
@@ -94,28 +95,37 @@ def set_up(node: Node) -> Callable[[], bool]:
             except RuntimeError:  # rclpy's RCLError is one
                 if rclpy.ok():
                     raise
-                return  # it is to stop
+                return  # the process is to stop
             published = time.monotonic_ns()
         treated = "silence" if silent else "bypass"
         release = Release(None if silent else arrival, arrival, None, 0, "cycle", treated)
         message = Waiting(payload, arrival, None, 0, about=source_timestamp)
         log.write(Outcome(message, release, time.monotonic_ns()), published)
 
-    def changed(what: str) -> None:
+    def changed(state: str) -> None:
         until = "nothing is published" if silent else "messages go around it"
-        back = what.startswith("is back")
-        logger.warning(f"{shaping_node} {what}" + ("" if back else f": {topic}: {until}"))
+        text = f"{shaping_node} {state}"
+        logger.warning(text if state.startswith("is back") else f"{text}: {topic}: {until}")
 
-    own = (parameters.handover, topic, publish, changed, parameters.patience_ns, asked.depth)
     standby = None
     while standby is None:
         try:
-            standby = Standby(*own, silent=silent)
+            standby = Standby(
+                parameters.handover,
+                topic,
+                publish,
+                changed,
+                parameters.patience_ns,
+                asked.depth,
+                silent=silent,
+            )
         except OSError as error:
             logger.error(f"{topic} falls silent when {shaping_node} does: {error}")
             wait(10.0)
 
-    def without_info(payload: bytes) -> None:  # so what the shaping node holds is lost with it
+    def without_info(payload: bytes) -> None:
+        # Without a source timestamp messages cannot be told apart: those that the shaping node has
+        # when it dies are lost.
         standby.arrived(payload, None)
 
     def with_info(payload: bytes, message_info: Any) -> None:

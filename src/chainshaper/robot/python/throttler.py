@@ -1,9 +1,9 @@
 """The throttler, for chains whose input is not quite periodic (paper, section 5.1).
 
 Each topic of ``inputs`` is republished on the topic of ``outputs`` in the same place, by a ``rule``
-of :mod:`chainshaper.robot.throttling`. What is dropped, and how often nothing had come, is said at
-the end. ``first`` is periodic only behind the paper's server, a slot of 2 ms in every cycle; the
-timer of ``newest`` is so on every kernel.
+of :mod:`chainshaper.robot.throttling`. At its end the node prints what it dropped, and how often
+nothing had come. The output of ``first`` is periodic only behind the paper's server, a slot of 2 ms
+in every cycle; the timer of ``newest`` makes it periodic on every kernel.
 """
 
 import atexit
@@ -31,7 +31,7 @@ from chainshaper.robot.throttling import RULES, FirstOfPeriod
 
 @dataclass
 class Channel:
-    """One topic on its way through, and what became of its messages."""
+    """One topic, and counts of what happened to its messages."""
 
     output: str
     send: Callable[[bytes], None]
@@ -51,7 +51,7 @@ class Channel:
             self.publish()
 
     def publish(self) -> None:
-        """Publish what is new."""
+        """Publish the newest message that came since the last one."""
         if self.newest is None:
             self.missing += 1
             text = f"nothing new for {self.output}; this is no. {self.missing}"
@@ -67,7 +67,7 @@ class Channel:
 
 
 def set_up(node: Node) -> Callable[[], bool]:
-    """Make the node's endpoints and timers; behind their callbacks nothing is left to do."""
+    """Make the node's endpoints and timers; return what :func:`.run` calls, which does nothing."""
     parameters = parameters_of(node)
     inputs, outputs, phase = parameters.inputs, parameters.outputs, parameters.phase_ns
     period, rule = parameters.period_ns, parameters.rule

@@ -27,30 +27,20 @@
 
 namespace chainshaper {
 
-// The gate that a node's parameters describe, with room for so many messages. Throws
-// std::invalid_argument for a word that there is not.
+// Returns the gate that a node's parameters describe, with room for so many messages. Throws
+// std::invalid_argument for an unknown word.
 inline Gate gate_of(const Parameters & parameters, std::size_t depth) {
-  const auto one_of = [](const auto & words, const std::string & word) {
-    if (const auto place = place_of(words, word)) return *place;
-    throw std::invalid_argument("'" + word + "' is no word for a gate");
-  };
   Gate gate;
+  static_cast<GateValues &>(gate) = parameters.gate_values();
   const auto & bounds = parameters.slots_ns;
   for (std::size_t i = 0; i + 1 < bounds.size(); i += 2)
     gate.slots.push_back({bounds[i], bounds[i + 1]});
-  gate.cycle_ns = parameters.cycle_ns;
-  gate.anchor = static_cast<Anchor>(one_of(anchor_names, parameters.anchor));
-  gate.phase_ns = parameters.phase_ns;
-  gate.overrun = static_cast<Policy>(one_of(policy_names, parameters.overrun));
-  gate.due_cycles = parameters.due_cycles;
-  gate.messages = static_cast<Messages>(one_of(messages_names, parameters.messages));
   gate.depth = depth;
-  gate.into_open_slot = static_cast<Entry>(one_of(entry_names, parameters.into_open_slot));
   if (!parameters.mode_topic.empty()) {
     gate.modes = parameters.mode_names;
     gate.bands.assign(parameters.mode_slots.begin(), parameters.mode_slots.end());
-    gate.first_mode = one_of(gate.modes, parameters.mode_default);
-    gate.late = static_cast<Policy>(one_of(policy_names, parameters.mode_late));
+    gate.first_mode = word_named<std::size_t>(gate.modes, parameters.mode_default);
+    gate.late = word_named<Policy>(policy_names, parameters.mode_late);
   }
   return gate;
 }
