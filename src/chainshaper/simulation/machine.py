@@ -336,8 +336,9 @@ class Machine:
             moves=gate.moved(timing.start_ns),
             spin_ns=gate.spin_ns,
             pause_ns=gate.pause_ns,
-            **values_of(gate.gate()),
         )
+        for name, value in values_of(gate.gate()).items():  # a name that C++ lacks is refused
+            setattr(found, name, value)
         found.phase_ns = timing.anchor_ns
         if gate.phase_ns is not None:
             found.phase_ns = timing.start_ns + gate.phase_ns
