@@ -374,7 +374,14 @@ class CoreDescription:
     open_servers: int
     next: int
     boundary_ns: int
-    def __init__(self, **fields: Any) -> None: ...
+    def __init__(
+        self,
+        *,
+        table: Sequence[tuple[int, int]] = ...,
+        open_servers: int = ...,
+        next: int = ...,
+        boundary_ns: int = ...,
+    ) -> None: ...
 
 class ThreadDescription:
     """A thread of a process; ``wake_up`` to ``delivery`` are places of streams."""
@@ -392,7 +399,23 @@ class ThreadDescription:
     pid: int
     tid: int
     cpu: int
-    def __init__(self, **fields: Any) -> None: ...
+    def __init__(
+        self,
+        *,
+        core: int = ...,
+        rank: int = ...,
+        server: int | None = ...,
+        role: Role = ...,
+        process: int = ...,
+        wake_up: int = ...,
+        take: int = ...,
+        publish: int = ...,
+        receive: int | None = ...,
+        delivery: int = ...,
+        pid: int = ...,
+        tid: int = ...,
+        cpu: int = ...,
+    ) -> None: ...
 
 class ProcessDescription:
     """A process: its executor, and its entities in the order in which that looks at them."""
@@ -400,7 +423,13 @@ class ProcessDescription:
     executor: ExecutorKind
     first_entity: int
     entity_count: int
-    def __init__(self, **fields: Any) -> None: ...
+    def __init__(
+        self,
+        *,
+        executor: ExecutorKind = ...,
+        first_entity: int = ...,
+        entity_count: int = ...,
+    ) -> None: ...
 
 class EntityDescription:
     """A timer, subscription, service or client with its callback."""
@@ -425,14 +454,42 @@ class EntityDescription:
     depth: int
     starts_chain: bool
     on_chain: bool
-    def __init__(self, **fields: Any) -> None: ...
+    def __init__(
+        self,
+        *,
+        callback: int = ...,
+        handle: int = ...,
+        rmw_handle: int = ...,
+        process: int = ...,
+        kind: EntityKind = ...,
+        group: int | None = ...,
+        body: Body = ...,
+        gate: int = ...,
+        synchroniser: int = ...,
+        input: int = ...,
+        period_ns: int = ...,
+        due_ns: int = ...,
+        execution: int = ...,
+        afterwards: int | None = ...,
+        first_publisher: int = ...,
+        publisher_count: int = ...,
+        lifespan_ns: int | None = ...,
+        depth: int = ...,
+        starts_chain: bool = ...,
+        on_chain: bool = ...,
+    ) -> None: ...
 
 class ReaderDescription:
     """An entity that reads a topic; ``delivery`` is the stream of its delivery times."""
 
     entity: int
     delivery: int | None
-    def __init__(self, **fields: Any) -> None: ...
+    def __init__(
+        self,
+        *,
+        entity: int = ...,
+        delivery: int | None = ...,
+    ) -> None: ...
 
 class PublisherDescription:
     """A callback's publisher of a topic."""
@@ -445,7 +502,18 @@ class PublisherDescription:
     lifespan_ns: int | None
     ends_chain: bool
     modes: list[int]
-    def __init__(self, **fields: Any) -> None: ...
+    def __init__(
+        self,
+        *,
+        handle: int = ...,
+        rmw_handle: int = ...,
+        readers: Sequence[ReaderDescription] = ...,
+        asynchronous: bool = ...,
+        depth: int = ...,
+        lifespan_ns: int | None = ...,
+        ends_chain: bool = ...,
+        modes: Sequence[int] = ...,
+    ) -> None: ...
 
 class GateDescription:
     """A gate in a callback: a `chainshaper.robot.gate.Gate`; ``modes`` are their numbers."""
@@ -467,21 +535,51 @@ class GateDescription:
     moves: list[tuple[int, int]]
     spin_ns: int
     pause_ns: int
-    def __init__(self, **fields: Any) -> None: ...
+    def __init__(
+        self,
+        *,
+        slots: Sequence[tuple[int, int]] = ...,
+        cycle_ns: int = ...,
+        anchor: str = ...,
+        phase_ns: int = ...,
+        overrun: str = ...,
+        due_cycles: int = ...,
+        mode_names: Sequence[str] = ...,
+        bands: Sequence[int] = ...,
+        first_mode: int = ...,
+        late: str = ...,
+        messages: str = ...,
+        depth: int = ...,
+        into_open_slot: str = ...,
+        modes: Sequence[int] = ...,
+        moves: Sequence[tuple[int, int]] = ...,
+        spin_ns: int = ...,
+        pause_ns: int = ...,
+    ) -> None: ...
 
 class InputDescription:
     """An input of a synchroniser."""
 
     on_chain: bool
     depth: int
-    def __init__(self, **fields: Any) -> None: ...
+    def __init__(
+        self,
+        *,
+        on_chain: bool = ...,
+        depth: int = ...,
+    ) -> None: ...
 
 class SynchroniserDescription:
     """Inputs that come together; ``trigger`` is the place of the one that completes sets."""
 
     inputs: list[InputDescription]
     trigger: int | None
-    def __init__(self, **fields: Any) -> None: ...
+    def __init__(
+        self,
+        *,
+        inputs: Sequence[InputDescription] = ...,
+        trigger: int | None = ...,
+    ) -> None: ...
 
 class Description:
     """All of a simulation; ``streams`` are constants, or None for one that is drawn."""
@@ -508,7 +606,32 @@ class Description:
     instances: int
     log_rows: int
     most_messages: int
-    def __init__(self, **fields: Any) -> None: ...
+    def __init__(
+        self,
+        *,
+        cores: Sequence[CoreDescription] = ...,
+        threads: Sequence[ThreadDescription] = ...,
+        processes: Sequence[ProcessDescription] = ...,
+        entities: Sequence[EntityDescription] = ...,
+        publishers: Sequence[PublisherDescription] = ...,
+        gates: Sequence[GateDescription] = ...,
+        synchronisers: Sequence[SynchroniserDescription] = ...,
+        streams: Sequence[int | None] = ...,
+        groups: int = ...,
+        cycle_ns: int = ...,
+        quantum_ns: int = ...,
+        context_switch_ns: int = ...,
+        preemption_ns: int = ...,
+        interrupts_ppm: int = ...,
+        last_timer_ns: int = ...,
+        stop_ns: int = ...,
+        record_from_ns: int = ...,
+        events: bool = ...,
+        switches: bool = ...,
+        instances: int = ...,
+        log_rows: int = ...,
+        most_messages: int = ...,
+    ) -> None: ...
 
 class Pause(Enum):
     """Why the engine was left."""

@@ -10,18 +10,18 @@ from chainshaper.workload.event_log import LAYOUT
 def described(**fields: object) -> _core.Description:
     """A timer that expires every 10 ns, up to 100."""
     timer = _core.EntityDescription(kind=_core.EntityKind.timer, period_ns=10, due_ns=10)
-    return _core.Description(
-        **{
-            "cores": [_core.CoreDescription()],
-            "threads": [_core.ThreadDescription(tid=7, pid=6, cpu=5)],
-            "processes": [_core.ProcessDescription(entity_count=1)],
-            "entities": [timer],
-            "streams": [0],
-            "stop_ns": 100,
-            "last_timer_ns": 100,
-            **fields,
-        }
+    description = _core.Description(
+        cores=[_core.CoreDescription()],
+        threads=[_core.ThreadDescription(tid=7, pid=6, cpu=5)],
+        processes=[_core.ProcessDescription(entity_count=1)],
+        entities=[timer],
+        streams=[0],
+        stop_ns=100,
+        last_timer_ns=100,
     )
+    for name, value in fields.items():
+        setattr(description, name, value)
+    return description
 
 
 def no_draws(stream: int) -> np.ndarray:
@@ -96,6 +96,6 @@ def test_a_description_without_sense_is_refused(wrong: dict[str, object]) -> Non
 
 def test_fields_and_words_that_there_are_not_are_refused() -> None:
     with pytest.raises(AttributeError):
-        _core.CoreDescription(slots=[])
+        _core.CoreDescription(slots=[])  # type: ignore[call-arg]
     with pytest.raises(ValueError, match="'soon' is not a word"):
         _core.GateDescription(overrun="soon")

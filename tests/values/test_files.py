@@ -173,6 +173,7 @@ _ELSEWHERE = {
     "linux/cgroups.py": "writes to files of the kernel",
     "enforcement/freezer.py": "writes to files of the kernel",
     "robot/schema_header.py": "is run where the package is built, for a file of the build",
+    "sources/preload/events_header.py": "is run where the package is built, as the one above",
     "robot/handover.py": "has memory in a folder of mode 0700, whose owner it checks",
     "robot/python/node.py": "runs in ROS nodes, which have nothing of ours",
 }

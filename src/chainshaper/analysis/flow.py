@@ -133,7 +133,7 @@ def data_flow(
     published = _published_in(published, instances, objects)
     if "rcl_timer_call" not in tables and instances["assumed"].any():
         published = _begun_outside(published, instances)
-    if sent.height:
+    if sent.height and received.height:
         published = _answered(published, taken)
     objects, instances, published = _with_assumed_writers(objects, instances, published)
     published = with_departures(published, tables, objects)
@@ -363,12 +363,16 @@ def _consumed(taken: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
 
 def _answered(published: pl.DataFrame, taken: pl.DataFrame) -> pl.DataFrame:
     """Responses belong to the instance that took the request: rclcpp sends them behind its end."""
-    calls = taken.filter(pl.col("source_timestamp") < 0, pl.col("instance").is_not_null())
-    calls = calls.filter(pl.col("topic").cast(pl.String).str.ends_with(REQUEST))
-    own = published.filter(pl.col("source_timestamp") < 0)
-    own = own.filter(pl.col("topic").cast(pl.String).str.ends_with(RESPONSE))
-    columns, call = ["instance", "callback_id"], ["pid", "source_timestamp"]
-    rows = own.drop(columns).join(calls.select(*call, *columns), on=call)
+    requests = taken.filter(
+        pl.col("call").is_not_null(),
+        pl.col("instance").is_not_null(),
+        pl.col("topic").cast(pl.String).str.ends_with(REQUEST),
+    )
+    responses = published.filter(
+        pl.col("call").is_not_null(), pl.col("topic").cast(pl.String).str.ends_with(RESPONSE)
+    )
+    columns, call = ["instance", "callback_id"], ["pid", "call"]
+    rows = responses.drop(columns).join(requests.select(*call, *columns), on=call)
     return published.with_columns(
         pl.coalesce(by_number(rows, "publication", column, published.height), column)
         for column in columns

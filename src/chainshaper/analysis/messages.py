@@ -19,8 +19,8 @@ of ROS 2 show different halves of that:
   address, or of a copy's, to the callback.
 
 Requests and responses of services are messages, too: a client publishes ``SERVICE:request``, which
-the server takes, and takes ``SERVICE:response``. In place of a source timestamp they have the
-number of their call, which is below 0 (:func:`service_calls`).
+the server takes, and takes ``SERVICE:response``. Instead of a source timestamp they have the number
+of their call (:func:`service_calls`).
 
 Where a thread of its own sends for the executor, `rmw_publish` is recorded when the message is
 handed over; `asynchronous_send` says when, and whether, it was sent.
@@ -43,6 +43,7 @@ _END: list[str | pl.Expr] = [
     pl.col("valid_from").alias("created"),
 ]  # of an endpoint, as a key
 _NO_TIME = pl.lit(None, dtype=pl.Int64)
+_NO_CALL = pl.lit(None, dtype=pl.Int64)
 
 _CALLS = {"rmw_send_request": "client", "rmw_take_request": "service"}
 _CALLS |= {"rmw_send_response": "service", "rmw_take_response": "client"}
@@ -61,7 +62,8 @@ def service_calls(
 ) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Requests and responses that were sent, and those taken: ``time, pid, tid, rmw_handle, call``.
 
-    A call is a client's, which numbers its own. Servers know clients by their gids.
+    ``call`` is the number of a call in the recording: of the client, and which of its calls it is.
+    Servers know clients by their gids.
     """
     columns = ["time", "pid", "tid", "rmw_handle"]
     if not any(events.table(tables, name).height for name in _CALLS):
@@ -82,7 +84,7 @@ def service_calls(
         rows = found[name].with_columns(gid=_gid_text("client_gid"))
         found[name] = rows.join(owners, on="gid", how="left", maintain_order="left")
     number = pl.col("client").cast(pl.Int64) * (1 << _CALL_BITS) + pl.col("sequence_number")
-    calls = {name: rows.select(*columns, call=-1 - number) for name, rows in found.items()}
+    calls = {name: rows.select(*columns, call=number) for name, rows in found.items()}
     sent, taken = ([calls[name] for name in _CALLS if way in name] for way in ("send", "take"))
     return pl.concat(sent), pl.concat(taken)
 
@@ -124,7 +126,8 @@ def publications(tables: events.EventTables, objects: Objects, calls: pl.DataFra
 
     Columns: ``publication`` (numbered from 0), ``time`` (of `rmw_publish`, the write to DDS; of
     the `rclcpp_intra_publish` when there was no such write), ``pid``, ``tid``, ``publisher``,
-    ``node``, ``topic``, ``source_timestamp`` (CLOCK_REALTIME, null if unknown) and ``intra_time``
+    ``node``, ``topic``, ``source_timestamp`` (CLOCK_REALTIME, null if unknown), ``call`` (of a
+    request or response, null for messages; absent where no service was called) and ``intra_time``
     (when it was handed to ring buffers of the same process, null if it was not).
     """
     written = _written(tables, objects, calls)
@@ -137,16 +140,19 @@ def publications(tables: events.EventTables, objects: Objects, calls: pl.DataFra
         first = pl.col("handed").is_first_distinct() & pl.col("handed").is_not_null()
         both = both.with_columns(pl.when(first).then("intra_time"))
         alone = handed.join(both.drop_nulls("intra_time"), on="handed", how="anti")
-        alone = alone.with_columns(time="intra_time", source_timestamp=_NO_TIME)
+        alone = alone.with_columns(time="intra_time", source_timestamp=_NO_TIME, call=_NO_CALL)
         every = pl.concat([one.select(every.columns) for one in (both, alone)])
     return in_order(every, "time", "pid", "tid").with_row_index("publication")
 
 
 def _written(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) -> pl.DataFrame:
-    """Messages given to DDS: ``time, pid, tid, publisher, node, topic, source_timestamp``."""
+    """Messages given to DDS: ``time, pid, tid, publisher, node, topic, source_timestamp``.
+
+    And ``call``, where services were called.
+    """
     writes = _writes(tables)
     if calls.height:
-        writes = pl.concat([writes, calls.rename({"call": "source_timestamp"})], how="diagonal")
+        writes = pl.concat([writes, calls], how="diagonal")
     by_rmw = objects.publishers.select(*_END, *_PUBLISHER)
     nameless = pl.col("rmw_handle").is_null()
     known = writes.filter(~nameless)
@@ -162,6 +168,8 @@ def _written(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) 
         rows = rows.with_columns(pl.when(~again.fill_null(False)).then("publisher_handle"))
         found.append(_by_rcl_handle(rows, objects, "time"))
     columns = ["time", "pid", "tid", *_PUBLISHER, "source_timestamp"]
+    if calls.height:
+        columns.append("call")
     every = pl.concat([frame.select(columns) for frame in found])
     return every.drop_nulls("publisher") if every["publisher"].null_count() else every
 
@@ -216,8 +224,9 @@ def takes(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) -> 
     """All messages taken by known subscriptions, sorted by time.
 
     Columns: ``take`` (numbered from 0), ``time``, ``pid``, ``tid``, ``callback_id`` (null if the
-    subscription has no callback), ``node``, ``topic``, ``source_timestamp``, ``intra_process``,
-    and for those the ``buffer`` and ``index`` the message lay in (null where CARET's events tell of
+    subscription has no callback), ``node``, ``topic``, ``source_timestamp``, ``call`` (of a request
+    or response, null for messages; absent where no service was called), ``intra_process``, and for
+    those the ``buffer`` and ``index`` the message lay in (null where CARET's events tell of
     them). A take that found nothing (``taken`` = 0) carries no message and is left out.
     """
     types = {name: objects.subscriptions.schema[name] for name in ("node", "topic")}
@@ -230,7 +239,7 @@ def takes(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) -> 
     taken = taken_by_rmw(tables).rename({"rmw_subscription_handle": "rmw_handle"})
     parts = [latest_before(taken, from_dds, key, "time", "created")]
     if calls.height:
-        calls = calls.rename({"call": "source_timestamp"})
+        calls = calls.with_columns(source_timestamp=_NO_TIME)
         parts.append(latest_before(calls, from_dds, key, "time", "created"))
     owners = callbacks.select("pid", *columns, callback="handle", created="valid_from")
     if taken.is_empty():
@@ -247,11 +256,14 @@ def takes(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) -> 
     dequeued = latest_before(dequeued, buffers, ["pid", "buffer"], "time", "valid_from")
     parts.append(dequeued.drop_nulls("callback_id").with_columns(**within))
     nowhere = pl.lit(None, dtype=pl.UInt64)
+    absent = {"buffer": nowhere, "index": nowhere}
+    if calls.height:
+        absent["call"] = _NO_CALL
     parts = [
         part.select(
             *("time", "pid", "tid", *columns),
             pl.when(pl.col("source_timestamp") != 0).then("source_timestamp"),
-            *(pl.col(n) if n in part.columns else nowhere.alias(n) for n in ("buffer", "index")),
+            *(pl.col(n) if n in part.columns else null.alias(n) for n, null in absent.items()),
             intra_process=pl.lit("intra_process" in part.columns),
         )
         for part in parts
@@ -273,6 +285,11 @@ def _dispatched(tables: events.EventTables) -> pl.DataFrame:
     return in_order(every, "time")
 
 
+def has_stampless(published: pl.DataFrame) -> bool:
+    """Whether some message has no source timestamp; requests and responses need none."""
+    return _messages(published)["source_timestamp"].null_count() > 0
+
+
 def link_takes(
     tables: events.EventTables, taken: pl.DataFrame, published: pl.DataFrame, clock_offset_ns: int
 ) -> tuple[pl.DataFrame, StampedMessages | None]:
@@ -282,11 +299,13 @@ def link_takes(
     timestamps, when the recording began; it is used only where publications carry no source
     timestamp. Also returns what was found there, if the clocks' distance alone did not tell.
     """
-    found = _with_same_stamp(taken, published)
+    found = _with_same(taken, published, "source_timestamp")
+    if "call" in taken.columns and "call" in published.columns:
+        found = pl.concat([found, _with_same(taken, published, "call")])
     linked = taken.with_columns(by_number(found, "take", "publication", taken.height))
     columns, followed = linked.columns, None
     through_buffer = pl.col("intra_time").is_not_null() & (pl.col("time") <= pl.col("intra_time"))
-    stampless = published.filter(pl.col("source_timestamp").is_null() & ~through_buffer)
+    stampless = _messages(published).filter(pl.col("source_timestamp").is_null() & ~through_buffer)
     unknown = linked.filter(pl.col("publication").is_null() & (pl.col("source_timestamp") > 0))
     if stampless.height and unknown.height:
         stampless = stampless.select("topic", "publisher", "time", guess="publication")
@@ -355,13 +374,17 @@ def _with_dispatched(
     return linked.with_columns(pl.coalesce("publication", stored))
 
 
-def _with_same_stamp(taken: pl.DataFrame, published: pl.DataFrame) -> pl.DataFrame:
-    """``take, publication`` that agree in topic and source timestamp.
+def _messages(published: pl.DataFrame) -> pl.DataFrame:
+    """The publications that are no requests and responses of services."""
+    return published.filter(pl.col("call").is_null()) if "call" in published.columns else published
+
+
+def _with_same(taken: pl.DataFrame, published: pl.DataFrame, stamp: str) -> pl.DataFrame:
+    """``take, publication`` that agree in topic and in the column ``stamp``.
 
     An asof join that insists on equality: unlike a hash join it stays linear in time and memory
     whatever the stamps are. Should two publications of a topic share one, the first is taken.
     """
-    stamp = "source_timestamp"
     wanted = taken.select("topic", stamp, "take")
     wanted = wanted.drop_nulls(stamp) if wanted[stamp].null_count() else wanted
     stamped = published.select("topic", "publication", stamped=stamp)

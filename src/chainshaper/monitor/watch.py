@@ -37,6 +37,7 @@ from chainshaper.analysis.latency import (
     latency_statistics,
     longest_times,
 )
+from chainshaper.analysis.messages import has_stampless
 from chainshaper.analysis.objects import Objects, resolve_objects
 from chainshaper.analysis.traversals import OWES_NO_OUTPUT
 from chainshaper.monitor.metrics import (
@@ -379,7 +380,7 @@ class Watch:
             watched = (output for output in find_outputs() if output.user in self.users)
             moved = {output.topic: output.moved_ns for output in watched}
         # Where publications carry no stamp, the clock's offset says which one was taken.
-        stampless = flow.publications["source_timestamp"].null_count() > 0
+        stampless = has_stampless(flow.publications)
         clear_ns = self._stepped_ns if stampless else 0
         within = pl.col("start").is_between(self._over_ns, over, "right")
         graph = graph_of(flow)

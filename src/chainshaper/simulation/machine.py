@@ -257,7 +257,7 @@ class Machine:
     def _entities(self) -> list[_core.EntityDescription]:
         system, entities = self._system, []
         # The entities of a callback share its streams, and its gate or synchroniser.
-        executions: dict[tuple[int, int], dict[str, int]] = {}
+        executions: dict[tuple[int, int], tuple[int, int | None]] = {}
         bodies: dict[tuple[int, int], int] = {}
         for number, entity in enumerate(system.entities):
             key, process = (entity.process, entity.index), system.processes[entity.process]
@@ -267,6 +267,7 @@ class Machine:
                 bodies[key] = self._add_body(entity.described)
             group = system.application.nodes[process.key].exclusive_group(entity.described)
             callback, handle, rmw_handle = self._handles.entities[number]
+            execution, afterwards = executions[key]
             described = _core.EntityDescription(
                 callback=callback,
                 handle=handle,
@@ -278,21 +279,22 @@ class Machine:
                 publisher_count=len(entity.publishers),
                 starts_chain=number in system.chain.callbacks[:1],
                 on_chain=number in system.chain.callbacks[1:],
-                **executions[key],
+                execution=execution,
+                afterwards=afterwards,
             )
             self._set_body(described, entity, bodies[key], number in system.chain.callbacks)
             self._set_trigger(described, entity)
             entities.append(described)
         return entities
 
-    def _executions(self, entity: Entity) -> dict[str, int]:
-        """The streams of a callback's times."""
+    def _executions(self, entity: Entity) -> tuple[int, int | None]:
+        """The streams of a callback's times: up to its publication, and afterwards (None: no)."""
         node, described = self._system.processes[entity.process].node, entity.described
-        streams = {"execution": self._streams.add(described.execution, node, entity.index)}
-        if described.afterwards is not None:
-            number = FIRST_AFTER + entity.index
-            streams["afterwards"] = self._streams.add(described.afterwards, node, number)
-        return streams
+        execution = self._streams.add(described.execution, node, entity.index)
+        if described.afterwards is None:
+            return execution, None
+        number = FIRST_AFTER + entity.index
+        return execution, self._streams.add(described.afterwards, node, number)
 
     def _group(self, process: int, group: str) -> int:
         return self._groups.setdefault((process, group), len(self._groups))
@@ -347,8 +349,9 @@ class Machine:
             moves=gate.moved(timing.start_ns),
             spin_ns=gate.spin_ns,
             pause_ns=gate.pause_ns,
-            **values_of(gate.gate()),
         )
+        for name, value in values_of(gate.gate()).items():  # a name that C++ lacks is refused
+            setattr(description, name, value)
         description.phase_ns = timing.anchor_ns
         if gate.phase_ns is not None:
             description.phase_ns = timing.start_ns + gate.phase_ns

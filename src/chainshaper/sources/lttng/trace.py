@@ -17,6 +17,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock
+from typing import get_args
 
 import polars as pl
 
@@ -37,6 +38,7 @@ from chainshaper.sources.system import (
 )
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.event_declarations import EventGroup, events_in_group
 from chainshaper.values.events import CREATION
 from chainshaper.values.middleware import rmw_of_threads
 from chainshaper.values.progress import Progress
@@ -44,11 +46,8 @@ from chainshaper.values.recording import Recording, RecordingInfo
 
 """Gets the share of the work that is done, from 0 to 1, and what is being done."""
 
-_EXECUTOR = frozenset(name for name in events.FIELDS if name.startswith("rclcpp_executor_"))
-_SWITCHES = frozenset(("sched_switch",))
-_UPPER_LAYERS = frozenset(("rclcpp_publish", "rcl_publish", "rcl_take", "rclcpp_take"))
-_MESSAGES = frozenset(events.FIELDS) - _EXECUTOR - _SWITCHES - CREATION - _UPPER_LAYERS
-_GROUPS = (CREATION, _MESSAGES, _UPPER_LAYERS, _EXECUTOR, _SWITCHES)
+_MESSAGES = events_in_group("messages")
+_GROUPS = tuple(events_in_group(group) for group in get_args(EventGroup))
 _WHO_RUNS = ("callback_start", "rmw_publish", "rmw_take", "rclcpp_publish")
 
 
