@@ -12,13 +12,13 @@
 #include <cstring>
 #include <memory>
 
-#include "shaper.hpp"
 #include "guest.hpp"
+#include "shaper.hpp"
 
 namespace chainshaper {
 
-// The file is read and written, never mapped: a process that maps a file which another one cuts, or for
-// which the disk has no room, is ended by SIGBUS. What is not there reads as 0.
+// The file is read and written, never mapped: a process that maps a file which another one cuts, or
+// for which the disk has no room, is ended by SIGBUS. What is not there reads as 0.
 class Page {
 public:
   // Throws where there is none and it is not to be made, or where it is not ours.
@@ -167,8 +167,8 @@ public:
     return failed < 0 ? 0.0 : std::min(10.0, std::ldexp(0.5, static_cast<int>(failed)));
   }
 
-  // Have cycles of a gate begin where they did for the one before it in the same launch, in its mode;
-  // the page shows each decision, and says how slots are to be moved.
+  // Have cycles of a gate begin where they did for the one before it in the same launch, in its
+  // mode; the page shows each decision, and says how slots are to be moved.
   template <typename Shaper>
   void go_on(Shaper & shaper) {
     shaper.moved = [this] { return moved(); };
@@ -272,7 +272,8 @@ private:
     if (parent != page->get(Field::parent) || idle_ns > schema::at_once_ns) {
       page->set(Field::mode, 0);  // another launch's
       page->set(Field::phase_known, 0);
-      if (!page->is_locked(schema::publishing)) {  // by a node of another launch, whose counts they are
+      if (!page->is_locked(
+              schema::publishing)) {  // by a node of another launch, whose counts they are
         page->set(Field::starts, 0);
         for (std::size_t count = Field::published; count <= Field::late; ++count)
           page->set(count, 0);
@@ -290,7 +291,8 @@ private:
       const auto holder = page_->get(Field::holder);
       if (holder > 0 && holder != getpid() && kill(static_cast<pid_t>(holder), 0) == 0)
         return false;  // another shaping node
-      gave_up_ = gave_up_ || monotonic_ns() > give_up;  // the standby was stopped while it published
+      gave_up_ =
+          gave_up_ || monotonic_ns() > give_up;  // the standby was stopped while it published
       if (gave_up_) break;
       sleep_until(monotonic_ns() + 1'000'000);
     }
