@@ -33,6 +33,8 @@ test-kernel: .venv/.ready-dev
 
 # The C++ library's sources; how each is compiled is what the last build noted.
 core = $(shell find core -name '*.[ch]pp')
+# C++ that is not in the library: shaping nodes, the gates in front of rmw, the described nodes.
+nodes = $(shell find src/chainshaper -name '*.[ch]pp')
 
 # The native library by itself, without Python, under sanitizers; each fuzz target runs for so many
 # seconds: `make core-tests FUZZ_SECONDS=36000` is a campaign.
@@ -49,7 +51,7 @@ lint: .venv/.ready-dev
 	.venv/bin/ruff format --check .
 	nice .venv/bin/mypy
 	nice .venv/bin/lint-imports --no-cache
-	.venv/bin/clang-format --dry-run --Werror $(core)
+	.venv/bin/clang-format --dry-run --Werror $(core) $(nodes)
 	nice .venv/bin/clang-tidy --quiet -p $(dir $(firstword $(shell ls -t build/cp*/compile_commands.json))) \
 		$(filter-out core/tests/% core/fuzz/%,$(filter %.cpp,$(core)))
 

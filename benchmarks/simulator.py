@@ -5,12 +5,12 @@
 The five-node chain of examples/synthetic_chain.yaml on one core, with every event written and with
 latencies only: chain instances per second of the process's CPU time, and of wall-clock time.
 
-Against the engine before, compiled by Numba, in turns: without events 1.36 times as many instances
-per second of CPU time (1,700,000 instead of 1,240,000 on quiet cores). With events it is 1.03
-times as many (180,000 instead of 175,000): three fifths of that time are Polars' for writing
-Parquet, half of them for dictionaries and a third for compressing. Threads write while the engine
-goes on: 1.7 times as many per second of wall-clock time, on two cores that others kept busy
-(medians of five runs in turns: 3.6 and 2.0 s for 200,000 cycles).
+Against the engine before, compiled by Numba, medians of runs in turns: without events 1.35 times
+as many instances per second of CPU time (1,670,000 instead of 1,240,000). With events the CPU time
+is nearly the same (141,000 instead of 138,000, beside other work): more than half of it is Polars
+writing Parquet, and two fifths of that is compression. Threads write while the engine goes on,
+which makes 1.8 times as many per second of wall-clock time in the same runs (2.0 instead of 3.6 s
+for 200,000 cycles on two cores that others kept busy).
 
 Peers run in interpreters of their own, such as those of throwaway virtual environments, since SimSo
 wants an old SimPy:

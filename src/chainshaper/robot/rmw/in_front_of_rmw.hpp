@@ -1,9 +1,9 @@
 // What the library in front of rmw has of ROS 2, for both its gates (`publisher_gate.cpp` and
 // `subscriber_gate.cpp`): structs of rmw, the functions behind ours, and the file of settings.
 //
-// Upstream: rmw, `rmw/types.h` and `rmw/rmw.h`, Humble to Rolling. The first fields of these structs
-// and the arguments of these functions are the same in all of them. Where ROS 2 is another one,
-// everything passes as if we were not here, and a line on stderr says so.
+// Upstream: rmw, `rmw/types.h` and `rmw/rmw.h`, Humble to Rolling. The first fields of these
+// structs and the arguments of these functions are the same in all of them. Where ROS 2 is another
+// one, everything passes as if we were not here, and a line on stderr says so.
 
 #pragma once
 
@@ -104,10 +104,10 @@ void * behind(const char * name) {
 
 // The function of that name behind ours, which is there: `usable` has looked, or its caller has
 // linked to it.
-#define RMW(name) \
-  (*[] { \
+#define RMW(name)                                                               \
+  (*[] {                                                                        \
     static const auto found = reinterpret_cast<decltype(&name)>(behind(#name)); \
-    return found; \
+    return found;                                                               \
   }())
 
 [[maybe_unused]] bool is_humble() {

@@ -31,10 +31,10 @@ void emit(void * event, Values... values) {
   using Emit = void (*)(std::conditional_t<true, std::uintptr_t, Values>...);
   if (event != nullptr) reinterpret_cast<Emit>(event)(std::uintptr_t(values)...);
 }
-#define EMIT(name, ...) \
-  do { \
+#define EMIT(name, ...)                                     \
+  do {                                                      \
     static void * const event = behind("ros_trace_" #name); \
-    emit(event, __VA_ARGS__); \
+    emit(event, __VA_ARGS__);                               \
   } while (false)
 
 // `rmw_publish` as the distribution has it: from Jazzy on with publisher and time stamp.
@@ -201,8 +201,8 @@ public:
   const void * rcl_publisher{nullptr};
 
 private:
-  // A page shows what becomes of the output; no standby looks at it. Cycles begin where they did for
-  // the process before this one, in its mode.
+  // A page shows what becomes of the output; no standby looks at it. Cycles begin where they did
+  // for the process before this one, in its mode.
   void show() {
     const auto & name = settings_.parameters.handover;
     if (name.empty()) return;
@@ -397,8 +397,8 @@ struct FoundObject {
   void * others[16];
 };
 
-// What making a mutex needs of the loader. It is asked as we are loaded: later it may have locks taken
-// for whose end a thread must not wait that makes a mutex.
+// What making a mutex needs of the loader. It is asked as we are loaded: later it may have locks
+// taken for whose end a thread must not wait that makes a mutex.
 struct Loader {
   decltype(&pthread_mutex_init) mutex_init{
       reinterpret_cast<decltype(&pthread_mutex_init)>(dlsym(RTLD_NEXT, "pthread_mutex_init"))};
@@ -477,15 +477,17 @@ EXPORTED int rmw_publish_serialized_message(const RmwPublisher * publisher, cons
   return RMW(rmw_publish_serialized_message)(publisher, message, allocation);
 }
 
-// A loaned message leaves as it is: it cannot wait without a copy. rclcpp asks before it borrows one,
-// and where the answer is no it publishes from memory of its own, which is shaped like any other.
+// A loaned message leaves as it is: it cannot wait without a copy. rclcpp asks before it borrows
+// one, and where the answer is no it publishes from memory of its own, which is shaped like any
+// other.
 EXPORTED bool rcl_publisher_can_loan_messages(const void * handle) {
   static std::atomic<bool> said;
   if (!RMW(rcl_publisher_can_loan_messages)(handle)) return false;
   const auto * const publisher = RMW(rcl_publisher_get_rmw_handle)(handle);
   if (output_of(publisher) == nullptr) return true;
   if (!said.exchange(true))
-    say("%s: no messages are loaned: they cannot wait for their slot without a copy, so the node's own"
+    say("%s: no messages are loaned: they cannot wait for their slot without a copy, so the node's "
+        "own"
         " memory is used; plan with --publication synchronous to have loans",
         publisher->topic);
   return false;
@@ -513,13 +515,14 @@ EXPORTED void ros_trace_rcl_publish(const void * handle, const void * message) {
   EMIT(rcl_publish, output == nullptr ? handle : output->input_handle(), message);
 }
 
-// A thread of real-time priority that waits for a mutex hands its priority on to the thread that has
-// it, as does the kernel for what is `PTHREAD_PRIO_INHERIT`: else an ordinary thread of the process
-// which loses its core within DDS keeps the chain's threads and the gate's waiting until it has one
-// again. Each call into Cyclone DDS takes a mutex that all threads share (`dds_handle_pin`).
+// A thread of real-time priority that waits for a mutex hands its priority on to the thread that
+// has it, as does the kernel for what is `PTHREAD_PRIO_INHERIT`: else an ordinary thread of the
+// process which loses its core within DDS keeps the chain's threads and the gate's waiting until it
+// has one again. Each call into Cyclone DDS takes a mutex that all threads share
+// (`dds_handle_pin`).
 //
-// Only mutexes that the middleware makes are changed. One with priority inheritance may be unlocked by
-// the thread only that has locked it, which a robot's own code need not keep to.
+// Only mutexes that the middleware makes are changed. One with priority inheritance may be unlocked
+// by the thread only that has locked it, which a robot's own code need not keep to.
 EXPORTED int pthread_mutex_init(pthread_mutex_t * mutex, const pthread_mutexattr_t * given) {
   const auto init = loader().mutex_init;
   if (!is_of_middleware(__builtin_return_address(0))) return init(mutex, given);

@@ -65,8 +65,7 @@ void wait_for(const void * subscription, const bool * taken, const MessageInfo *
 EXPORTED void * rmw_create_subscription(const RmwNode * node, const void * type_support,
                                         const char * topic, const RmwQos * qos,
                                         const void * options) {
-  void * const subscription =
-      RMW(rmw_create_subscription)(node, type_support, topic, qos, options);
+  void * const subscription = RMW(rmw_create_subscription)(node, type_support, topic, qos, options);
   try {
     remember(subscription, node, topic);
   } catch (const std::exception & error) {
@@ -81,12 +80,12 @@ EXPORTED int rmw_destroy_subscription(RmwNode * node, void * subscription) {
   return RMW(rmw_destroy_subscription)(node, subscription);
 }
 
-#define TAKE(name) \
+#define TAKE(name)                                                                               \
   EXPORTED int name(const void * subscription, void * message, bool * taken, MessageInfo * info, \
-                    void * allocation) { \
-    const int code = RMW(name)(subscription, message, taken, info, allocation); \
-    if (code == 0) wait_for(subscription, taken, info); \
-    return code; \
+                    void * allocation) {                                                         \
+    const int code = RMW(name)(subscription, message, taken, info, allocation);                  \
+    if (code == 0) wait_for(subscription, taken, info);                                          \
+    return code;                                                                                 \
   }
 TAKE(rmw_take_with_info)
 TAKE(rmw_take_serialized_message_with_info)

@@ -1,9 +1,9 @@
 // The latency-shaping node: what it receives on `input` it republishes on `output` in the slots of
 // its server (Managing End-to-End Timing Jitters in ROS2 Computation Chains, section 3.2.2), as
-// chainshaper's Python node, which explains it. One source for three packages: with `message.hpp` it
-// is for that type of message, without it for any, byte for byte. With CHAINSHAPER_COMPONENT it is a
-// component for that type: in the publisher's container it takes the publisher's own message, and
-// publishes that very one. The container's executor has the services of its node only.
+// chainshaper's Python node, which explains it. One source for three packages: with `message.hpp`
+// it is for that type of message, without it for any, byte for byte. With CHAINSHAPER_COMPONENT it
+// is a component for that type: in the publisher's container it takes the publisher's own message,
+// and publishes that very one. The container's executor has the services of its node only.
 
 #include <dlfcn.h>
 
@@ -403,7 +403,8 @@ private:
 // Its class has the name of the package: a container may have one for each of several types.
 namespace CHAINSHAPER_COMPONENT {
 
-// What is loaded into a container. The gate waits in a thread of its own, as an executor of its own.
+// What is loaded into a container. The gate waits in a thread of its own, as an executor of its
+// own.
 class ShapingNode {
 public:
   explicit ShapingNode(rclcpp::NodeOptions options)
@@ -472,7 +473,8 @@ RCLCPP_COMPONENTS_REGISTER_NODE(CHAINSHAPER_COMPONENT::ShapingNode)
 #else
 
 int main(int argc, char ** argv) {
-  std::signal(SIGXFSZ, SIG_IGN);  // a log that may grow no further (`ulimit -f`) is no reason to end
+  std::signal(SIGXFSZ,
+              SIG_IGN);  // a log that may grow no further (`ulimit -f`) is no reason to end
   std::optional<Shaping> shaping;
   return run(argc, argv, "chainshaper_shaping", [&](rclcpp::Node & node) -> std::function<bool()> {
     auto turn = turn_of(node);

@@ -1,6 +1,6 @@
-// The throttler, for chains whose input is not quite periodic (Managing End-to-End Timing Jitters in
-// ROS2 Computation Chains, section 5.1). chainshaper's Python throttler does the same; its source
-// says what that is.
+// The throttler, for chains whose input is not quite periodic (Managing End-to-End Timing Jitters
+// in ROS2 Computation Chains, section 5.1). chainshaper's Python throttler does the same; its
+// source says what that is.
 
 #include <memory>
 #include <string>
@@ -79,7 +79,7 @@ int main(int argc, char ** argv) {
         return [] { return false; };
       });
   for (const auto & channel : channels)
-    std::printf("%s: %zu published, %zu times nothing new, %zu dropped\n",
-                channel->output.c_str(), channel->published, channel->missing, channel->dropped);
+    std::printf("%s: %zu published, %zu times nothing new, %zu dropped\n", channel->output.c_str(),
+                channel->published, channel->missing, channel->dropped);
   return code;
 }

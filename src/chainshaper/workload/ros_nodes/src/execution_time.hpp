@@ -19,16 +19,18 @@ struct Execution {
 // Seed, node and callback determine the sequence; of stretches of samples the seed alone, so that
 // callbacks that were measured together draw together.
 class ExecutionTimes {
- public:
-  ExecutionTimes(Execution execution, std::uint64_t seed, std::uint32_t node, std::uint32_t callback)
+public:
+  ExecutionTimes(Execution execution, std::uint64_t seed, std::uint32_t node,
+                 std::uint32_t callback)
       : execution_{std::move(execution)} {
-    const auto low = static_cast<std::uint32_t>(seed), high = static_cast<std::uint32_t>(seed >> 32);
+    const auto low = static_cast<std::uint32_t>(seed),
+               high = static_cast<std::uint32_t>(seed >> 32);
     std::seed_seq together{low, high}, own{low, high, node, callback};
     random_.seed(execution_.block > 1 ? together : own);
   }
 
   std::int64_t next() {
-    const auto &values = execution_.values;
+    const auto & values = execution_.values;
     if (values.empty()) return 0;
     switch (execution_.distribution) {
       case Distribution::uniform:
@@ -40,9 +42,8 @@ class ExecutionTimes {
           if (values[2] <= drawn && drawn <= values[3]) return static_cast<std::int64_t>(drawn);
         }
       case Distribution::samples:
-        if (drawn_++ % execution_.block == 0) {
+        if (drawn_++ % execution_.block == 0)
           place_ = std::uniform_int_distribution<std::size_t>{0, values.size() - 1}(random_);
-        }
         return values[place_++ % values.size()];
       case Distribution::sequence:
         return values[place_++ % values.size()];
@@ -51,7 +52,7 @@ class ExecutionTimes {
     }
   }
 
- private:
+private:
   Execution execution_;
   std::mt19937_64 random_;
   std::size_t drawn_{0}, place_{0};

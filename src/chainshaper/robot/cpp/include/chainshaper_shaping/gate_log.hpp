@@ -16,14 +16,14 @@
 #include <string_view>
 #include <thread>
 
-#include "shaper.hpp"
 #include "guest.hpp"
+#include "shaper.hpp"
 
 namespace chainshaper {
 
-// Lines on their way from the gate's thread, which never waits, to the one that writes them. (A pipe
-// would do it too, but a process that closes all descriptors and uses the numbers again would get our
-// lines in files of its own.)
+// Lines on their way from the gate's thread, which never waits, to the one that writes them. (A
+// pipe would do it too, but a process that closes all descriptors and uses the numbers again would
+// get our lines in files of its own.)
 class LineQueue {
 public:
   LineQueue() { sem_init(&more_, 0, 0); }
@@ -50,8 +50,9 @@ public:
     sem_post(&more_);
   }
 
-  // Wait for lines and take some of them, one at least; false: there are none, and none come any more.
-  // Each line has its own post of the semaphore, so that those that are left are taken the next time.
+  // Wait for lines and take some of them, one at least; false: there are none, and none come any
+  // more. Each line has its own post of the semaphore, so that those that are left are taken the
+  // next time.
   bool take(std::string & lines) {
     while (sem_wait(&more_) != 0) continue;  // a signal ended the wait early
     const bool is_last = ended_;
@@ -66,7 +67,8 @@ public:
 
 private:
   static constexpr std::size_t room = 1 << 20;
-  static constexpr std::size_t at_once = 4096;  // bytes: a file's bound holds for what is added, too
+  static constexpr std::size_t at_once =
+      4096;  // bytes: a file's bound holds for what is added, too
 
   std::unique_ptr<std::array<char, room>> bytes_{std::make_unique<std::array<char, room>>()};
   std::atomic<std::size_t> put_{0};    // bytes so far

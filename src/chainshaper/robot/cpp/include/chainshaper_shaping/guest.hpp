@@ -17,8 +17,9 @@
 
 namespace chainshaper {
 
-// Blocks SIGXFSZ in the calling thread while it lives, and takes back what came meanwhile: the signal
-// comes where a file would get larger than `ulimit -f` allows, and by default it ends the process.
+// Blocks SIGXFSZ in the calling thread while it lives, and takes back what came meanwhile: the
+// signal comes where a file would get larger than `ulimit -f` allows, and by default it ends the
+// process.
 class FileSizeSignalBlocked {
 public:
   FileSizeSignalBlocked() {
@@ -67,8 +68,8 @@ private:
   sigset_t before_;
 };
 
-// An open file. A process may close all descriptors by their numbers and use these again, as daemons
-// do: so each use asks first whether the number is still this file's.
+// An open file. A process may close all descriptors by their numbers and use these again, as
+// daemons do: so each use asks first whether the number is still this file's.
 class File {
 public:
   File() = default;

@@ -12,9 +12,9 @@
 #include <cstring>
 #include <memory>
 
-#include "shaper.hpp"
 #include "rclcpp/rclcpp.hpp"
 #include "rclcpp/version.h"
+#include "shaper.hpp"
 
 #if !RCLCPP_VERSION_GTE(25, 0, 0)
 #include "rcl/subscription.h"
@@ -105,8 +105,8 @@ inline std::optional<Offer> wait_for_publisher(rclcpp::Node & node, const std::s
   return std::nullopt;
 }
 
-// Give the calling thread its core and SCHED_FIFO priority, and lock the memory of a process that is
-// ours. To be called when all endpoints exist: threads inherit, and those of DDS must not; later
+// Give the calling thread its core and SCHED_FIFO priority, and lock the memory of a process that
+// is ours. To be called when all endpoints exist: threads inherit, and those of DDS must not; later
 // ones do not get the class.
 inline void become_realtime(rclcpp::Node & node) {
   const auto warn = [&](const std::string & what, const char * remedy) {
@@ -199,9 +199,11 @@ private:
 
 #endif
 
-inline rclcpp::GenericSubscription::SharedPtr subscribe_serialized(
-    rclcpp::Node & node, const std::string & topic, const std::string & type,
-    const rclcpp::QoS & qos, Taken taken) {
+inline rclcpp::GenericSubscription::SharedPtr subscribe_serialized(rclcpp::Node & node,
+                                                                   const std::string & topic,
+                                                                   const std::string & type,
+                                                                   const rclcpp::QoS & qos,
+                                                                   Taken taken) {
 #if RCLCPP_VERSION_GTE(25, 0, 0)
   return node.create_generic_subscription(topic, type, qos, taken);
 #else

@@ -79,8 +79,7 @@ public:
     socklen_t length = sizeof(address);
     auto * const general = reinterpret_cast<sockaddr *>(&address);
     const int number = to_itself_.number();
-    connected_ = bind(number, general, length) == 0 &&
-                 getsockname(number, general, &length) == 0 &&
+    connected_ = bind(number, general, length) == 0 && getsockname(number, general, &length) == 0 &&
                  connect(number, general, length) == 0;
   }
 
