@@ -46,6 +46,7 @@ from numpy.typing import NDArray
 from chainshaper.monitor import watch as watch_module
 from chainshaper.monitor.watch import Watch
 from chainshaper.sources.preload import _HEADER, _RING, RECORD, TracedProcess, event_names
+from chainshaper.sources.preload.events_header import FORMAT
 from chainshaper.values.durations import parse_duration
 
 US, MS, SECOND = 1_000, 1_000_000, 1_000_000_000
@@ -148,7 +149,7 @@ class Process:
                 words = np.frombuffer(text.encode().ljust(40, b"\0"), np.uint64).tolist()
                 objects.append(_record(created_ns, pid, 1, [16 * len(text) + place, *words]))
         sizes = (RINGS, RING_RECORDS, OBJECT_RECORDS)
-        header = np.array([(0x63687368, 2, pid, *sizes, len(objects), 0, 0, [0] * 2)], _HEADER)
+        header = np.array([(0x63687368, FORMAT, pid, *sizes, len(objects), 0, 0, [0] * 2)], _HEADER)
         os.pwrite(self.file, np.array(objects, RECORD).tobytes(), self._of_objects)
         os.pwrite(self.file, header.tobytes(), 0)
 

@@ -117,7 +117,7 @@ def test_python_dash_m_imports_from_no_current_folder(tmp_path: Path) -> None:
 def copied(folder: Path) -> Path:
     """The package where nothing but PYTHONPATH leads to, as colcon installs it."""
     root = folder / "install"
-    values = ("__init__", "errors", "files", "leftovers")
+    values = ("__init__", "errors", "files", "leftovers", "middleware")
     linux = ("__init__", "own_processes", "scheduling", "threads")
     for name in ("__init__", *(f"values/{v}" for v in values), *(f"linux/{one}" for one in linux)):
         place = root / "chainshaper" / f"{name}.py"
