@@ -1,5 +1,6 @@
 """The public names: all there, and free of charge until they are used."""
 
+import ast
 import subprocess
 import sys
 from pathlib import Path
@@ -55,3 +56,32 @@ def test_the_gate_needs_the_standard_library_only() -> None:
     ours += [f"chainshaper.robot.{path.stem}" for path in robot.glob("[a-z]*.py")]
     loaded = _modules_after(f"import {', '.join(ours)}") - _modules_after("pass")
     assert loaded - {"chainshaper"} <= sys.stdlib_module_names
+
+
+def test_every_name_that_our_code_takes_from_the_package_exists() -> None:
+    """Names are resolved when they are used, so no type checker sees one that is gone."""
+    sources = Path(chainshaper.__file__).parent
+    taken: dict[str, str] = {}  # name → a file that takes it
+    for path in sources.rglob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        aliases = {
+            alias.asname or alias.name
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Import)
+            for alias in node.names
+            if alias.name == "chainshaper"
+        }
+        for node in ast.walk(tree):
+            if (
+                isinstance(node, ast.Attribute)
+                and isinstance(node.value, ast.Name)
+                and node.value.id in aliases
+            ):
+                taken[node.attr] = str(path.relative_to(sources))
+    rooms = {path.name for path in sources.iterdir() if path.is_dir()}
+    assert len(taken) > 30, "the CLI takes most of its names so"
+    assert {
+        name: file
+        for name, file in taken.items()
+        if name not in chainshaper.__all__ and name not in rooms and not name.startswith("__")
+    } == {}

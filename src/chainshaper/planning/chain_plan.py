@@ -95,39 +95,37 @@ class ChainOfPlan(Part):
 class Evidence(Part):
     """The measurements that the plan rests on: end-to-end latencies under high SCHED_FIFO.
 
-    They are of undisturbed cycles, or of all, where the machine disturbed all but one at most
-    (``all_disturbed``). ``max_of_all_ns`` is of all, ``incomplete`` counts traversals without an
-    end, ``unpublished`` those of them that the application ended without a publication,
-    ``utilisation`` is the share of its core that the chain takes, ``interference_ns`` the part
-    of the average and the longest latency that is for others
-    (:mod:`~chainshaper.planning.profile`). ``longest_send_ns`` is of the output's asynchronous
-    publisher, ``longest_publication_ns`` of its synchronous one; ``publish_slot`` says where Δ is
-    from. ``delivery_ns`` is how long an output is on its way to its receiver's callback: least,
-    mean and longest, without the time for which others had that one's core. ``intra_process``:
-    subscribers get the output without DDS. None is: not known.
+    What is None is not known.
     """
 
-    recording: str | None = None
-    samples: FromOne
+    recording: str | None = None  # its path
+    samples: FromOne  # cycles that the three latencies are of
+    # Of undisturbed cycles; of all cycles, if `all_disturbed`.
     min_latency_ns: Duration
     mean_latency_ns: Duration
     max_latency_ns: PositiveDuration
-    max_of_all_ns: PositiveDuration | None = None
-    incomplete: Count = 0
-    unpublished: Count = 0
-    disturbed: Count = 0
-    realtime: bool | None = None
-    longest_stall_ns: Duration | None = None
+    max_of_all_ns: PositiveDuration | None = None  # of all cycles, disturbed ones included
+    incomplete: Count = 0  # traversals without an end
+    unpublished: Count = 0  # those of them that the application ended without a publication
+    disturbed: Count = 0  # cycles that the machine disturbed
+    realtime: bool | None = None  # whether the chain ran with SCHED_FIFO
+    longest_stall_ns: Duration | None = None  # of the machine, during the recording
+    # The share of its core that the chain takes, 0 to 1.
     utilisation: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    # The part of the average and of the longest latency that is for others
+    # (:mod:`~chainshaper.planning.profile`).
     interference_ns: Duration | None = None
-    longest_send_ns: Duration | None = None
-    longest_publication_ns: Duration | None = None
+    longest_send_ns: Duration | None = None  # by the output's asynchronous publisher
+    longest_publication_ns: Duration | None = None  # by its synchronous publisher
+    # Where the length of the publish slot (Δ of section 4.1) is from.
     publish_slot: Literal["given", "measured", "least"] | None = None
+    # How long an output is on its way to its receiver's callback: least, mean and longest, without
+    # the time for which others had that callback's core.
     delivery_ns: tuple[Duration, Duration, Duration] | None = None
-    lost_events: FromOne | None = None
-    all_disturbed: Literal[True] | None = None
-    intra_process: Literal[True] | None = None
-    modes: "dict[ModeName, Evidence] | None" = None
+    lost_events: FromOne | None = None  # lost by the tracer
+    all_disturbed: Literal[True] | None = None  # at most one cycle was undisturbed
+    intra_process: Literal[True] | None = None  # subscribers get the output without DDS
+    modes: "dict[ModeName, Evidence] | None" = None  # the same for the cycles in each mode
 
     @model_validator(mode="after")
     def _ordered(self) -> "Evidence":

@@ -80,75 +80,86 @@ class Reception(NamedTuple):
 class Profile:
     """What was measured of one chain, under a high SCHED_FIFO priority. Times in nanoseconds.
 
-    ``latencies_ns`` are those of undisturbed cycles (where ``all_disturbed``, of all),
-    ``every_latency_ns`` those of all (None: all were undisturbed), both in the order of time;
-    ``starts_ns`` is when each of the former began in the recording (None: a period apart), and
-    ``measured_ns`` what it took there, where others may delay it to the latency (None: that).
-    ``nodes`` and ``topics`` have the node and the topic of each callback of the chain. ``core_of``
-    names the core of every node whose executor takes part, also on branches that the chain waits
-    for; of a node with several executors, ``executors`` are those that take part, each by its
-    callbacks. ``cores`` is for any node of the recording with one core. ``begins`` is the first
-    callback's number in the graph, and its name, ``upstream`` the topics that the output waits for:
-    on the chain, on those branches, and before. ``callbacks`` are those of the chain and its
-    branches, see :func:`~chainshaper.planning.shaping.server_per_callback`. ``steps_ns`` and
-    ``every_step_ns`` are what each callback of the chain took, a row per latency;
-    ``graph_steps_ns`` and ``every_graph_step_ns`` the same of ``callbacks``, where some are on
-    branches: ``begins_ns`` is how long after the chain each began, at most, which waits for none,
-    :data:`UNKNOWN` where that varies.
-    ``asynchronous``: the process of the output's writer has a thread that publishes. ``together``
-    are nodes that share a process, ``simulated`` nodes of the chain that follow `/clock`,
-    ``others_ns`` is for how long gates of other chains may have its cores in a cycle,
-    ``interfering`` what else the chain's threads run, ``contradictions`` what in the recording's
-    events contradicts itself about its callbacks, in words; ``reception`` is None where nothing
-    says how the output is received. The rest is
-    :class:`~chainshaper.planning.chain_plan.Evidence`, and :class:`~.chain_plan.ChainOfPlan`.
+    Every field but the latencies and the period may be unknown: plans from bare latencies have no
+    more than these two. What ends up in the plan file is :class:`~.chain_plan.ChainOfPlan` and
+    :class:`~.chain_plan.Evidence`, whose fields have the same names here.
     """
 
+    # Latencies and when they were ---------------------------------------------------------------
+    # End-to-end latencies of undisturbed cycles, in the order of time (of all, if `all_disturbed`).
     latencies_ns: NDArray[np.int64]
     period_ns: int
+    # The latencies of all cycles, in the order of time. None: all cycles were undisturbed.
     every_latency_ns: NDArray[np.int64] | None = None
+    # When each cycle of `latencies_ns` began in the recording. None: a period apart.
     starts_ns: NDArray[np.int64] | None = None
+    # What each cycle took in the recording, where others may delay it to the latency. None: that.
     measured_ns: NDArray[np.int64] | None = None
-    spec: str | None = None
-    nodes: tuple[str, ...] = ()
-    topics: tuple[str, ...] = ()
-    begins: tuple[int, str] | None = None
+
+    # The chain and the graph around it ----------------------------------------------------------
+    spec: str | None = None  # the chain as the user wrote it: /t1../t5
+    nodes: tuple[str, ...] = ()  # the node of each callback of the chain
+    topics: tuple[str, ...] = ()  # the topic that each callback of the chain publishes
+    begins: tuple[int, str] | None = None  # the first callback: its number in the graph, its name
+    # Topics that the output waits for: on the chain, on its branches, and before them.
     upstream: frozenset[str] = frozenset()
+    # Node → core of its executor, for all nodes that take part, also on branches waited for.
     core_of: Mapping[str, int] = field(default_factory=dict)
+    # Node with several executors → those that take part, each by the names of its callbacks.
     executors: Mapping[str, tuple[tuple[str, ...], ...]] = field(default_factory=dict)
-    cores: Mapping[str, int] = field(default_factory=dict)
-    every_node: tuple[str, ...] = ()
-    together: tuple[tuple[str, ...], ...] = ()
-    receivers: tuple[str, ...] = ()
+    cores: Mapping[str, int] = field(default_factory=dict)  # any node with one core → that core
+    every_node: tuple[str, ...] = ()  # all nodes of the recording
+    together: tuple[tuple[str, ...], ...] = ()  # nodes that share a process
+    receivers: tuple[str, ...] = ()  # nodes that subscribe to the output
+    # How the output is received. None: nothing in the recording says it.
     reception: Reception | None = None
+    # The callbacks of the chain and of the branches that it waits for, with their servers' times
+    # (:func:`~chainshaper.planning.shaping.server_per_callback`).
     callbacks: tuple[CallbackTimes, ...] = ()
+
+    # What each callback took --------------------------------------------------------------------
+    # A row for each latency of `latencies_ns`, a column for each callback of the chain.
     steps_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
+    # The same for `every_latency_ns`.
     every_step_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
+    # The same as `steps_ns`, with a column for each of `callbacks`, where some are on branches.
     graph_steps_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
+    # The same for `every_latency_ns`.
     every_graph_step_ns: NDArray[np.int64] = field(
         default_factory=lambda: np.zeros((0, 0), np.int64)
     )
+    # Of each of `callbacks` that waits for none: how long after the chain it began, at most;
+    # :data:`UNKNOWN` where that varies.
     begins_ns: tuple[int, ...] = ()
-    fifo_priority: int = 84
-    output_depth: int | None = None
-    recording: str | None = None
-    incomplete: int = 0
-    unpublished: int = 0
-    disturbed: int = 0
-    realtime: bool | None = None
-    longest_stall_ns: int | None = None
-    utilisation: float | None = None
-    interference_ns: int | None = None
-    others_ns: int = 0
-    longest_send_ns: int | None = None
-    longest_publication_ns: int | None = None
-    asynchronous: bool | None = None
-    intra_process: Literal[True] | None = None
-    simulated: tuple[str, ...] = ()
-    interfering: tuple[Interfering, ...] = ()
+
+    # How it ran and was recorded ----------------------------------------------------------------
+    fifo_priority: int = 84  # for the shaping node: above the executor that publishes the output
+    output_depth: int | None = None  # history depth of the output's writer
+    recording: str | None = None  # the recording's path
+    incomplete: int = 0  # traversals without an end
+    unpublished: int = 0  # those of them that the application ended without a publication
+    disturbed: int = 0  # cycles that the machine disturbed
+    realtime: bool | None = None  # whether the chain ran with SCHED_FIFO
+    longest_stall_ns: int | None = None  # of the machine, during the recording
+    lost_events: int | None = None  # lost by the tracer
+    all_disturbed: bool | None = None  # whether at most one cycle was undisturbed
+    simulated: tuple[str, ...] = ()  # nodes of the chain that follow /clock
+    # What in the recording's events contradicts itself about the chain's callbacks, in words.
     contradictions: tuple[str, ...] = ()
-    lost_events: int | None = None
-    all_disturbed: bool | None = None
+
+    # What else runs on its cores ----------------------------------------------------------------
+    utilisation: float | None = None  # the share of its core that the chain takes, 0 to 1
+    interference_ns: int | None = None  # the part of the latencies that is for others
+    others_ns: int = 0  # for how long gates of other chains may have its cores in a cycle
+    interfering: tuple[Interfering, ...] = ()  # what else the chain's threads run
+
+    # How the output is published ----------------------------------------------------------------
+    longest_send_ns: int | None = None  # by the output's asynchronous publisher
+    longest_publication_ns: int | None = None  # by its synchronous publisher
+    asynchronous: bool | None = None  # whether the writer's process has a thread that publishes
+    intra_process: Literal[True] | None = None  # subscribers get the output without DDS
+
+    # Mode → the profile of the cycles in that mode, where modes were recorded.
     of_modes: Mapping[str, "Profile"] = field(default_factory=dict)
 
     @property
