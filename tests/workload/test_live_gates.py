@@ -1,5 +1,6 @@
 """Gates in live runs: logical execution time, several messages a cycle, and modes."""
 
+import os
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from chainshaper import (
 )
 from chainshaper.planning import ChainPlan, Modes, Plan, PlanRequest
 from chainshaper.planning.chain_plan import revised
+from chainshaper.robot.handover import page_folders
 from chainshaper.splicing.application import splice_application
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
@@ -43,6 +45,17 @@ def test_let_per_callback_has_no_jitter_of_a_period(tmp_path: Path, unshaped: Re
     assert (latencies < 3.5 * PERIOD_NS).sum() >= 0.8 * latencies.len()
     simulated = simulate(application, tmp_path / "simulated", Plan.of(plan), cycles=20)
     assert measure_latency(simulated).analysis.statistics.jitter_ns == 0
+
+
+def test_a_run_that_ends_leaves_no_page_of_its_outputs(tmp_path: Path, plan: ChainPlan) -> None:
+    shape_application(small_chain(tmp_path), Plan.of(plan), tmp_path / "run", cycles=5)
+    left = [
+        page
+        for folder in page_folders()
+        for page in (Path(folder).iterdir() if Path(folder).exists() else ())
+        if page.name.startswith("live.") and page.stat().st_uid == os.geteuid()
+    ]
+    assert left == []
 
 
 def application_of(messages: str, depth: int) -> Application:

@@ -18,6 +18,7 @@ from chainshaper.planning.plan import Plan, open_until_done
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.application import splice_application
+from chainshaper.splicing.shaped_outputs import remove_abandoned_pages
 from chainshaper.values.errors import OperationError
 from chainshaper.values.files import write_whole
 from chainshaper.values.progress import Progress
@@ -61,16 +62,19 @@ def shape_application(
     if adapt:
         plan, reaches_ns, _ = followed_chains(plan, "fifo", max_latency_ns)
         enforcement = partial(slots_followed, plan, reaches_ns, enforcement)
-    return run_application(
-        splice_application(application, plan),
-        output,
-        cycles=cycles,
-        realtime=realtime,
-        plan=plan_values(plan),
-        enforcement=enforcement,
-        command=command,
-        progress=progress,
-    )
+    try:
+        return run_application(
+            splice_application(application, plan),
+            output,
+            cycles=cycles,
+            realtime=realtime,
+            plan=plan_values(plan),
+            enforcement=enforcement,
+            command=command,
+            progress=progress,
+        )
+    finally:
+        remove_abandoned_pages()  # of the shaping nodes, which have ended
 
 
 def gated_threads(plan: Plan) -> list[tuple[Server, list[Thread]]]:

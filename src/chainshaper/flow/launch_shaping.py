@@ -38,6 +38,7 @@ from chainshaper.planning.profile import doubts_about
 from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.node_kinds import language_of
 from chainshaper.splicing.node_packages import build_package, check_build_tools
+from chainshaper.splicing.shaped_outputs import remove_abandoned_pages
 from chainshaper.splicing.spliced_launch import NODES, parse_launch_command
 from chainshaper.values.application import ApplicationGraph
 from chainshaper.values.errors import InputError, OperationError
@@ -166,15 +167,18 @@ def shape_launch(
     in_force = plan_in_force(
         plan, back_end, first, user_ids, notes, adapt=adapt, max_latency_ns=max_latency_ns
     )
-    after = recorder.record(
-        "after",
-        shaped,
-        duration_ns,
-        scheduling=in_force,
-        plan=plan,
-        gate_logs=() if splicing is None else splicing.logs,
-        chain=chains[0],
-    )
+    try:
+        after = recorder.record(
+            "after",
+            shaped,
+            duration_ns,
+            scheduling=in_force,
+            plan=plan,
+            gate_logs=() if splicing is None else splicing.logs,
+            chain=chains[0],
+        )
+    finally:
+        remove_abandoned_pages()  # of the shaping nodes, which have ended
     progress(0.0, "comparing")
     comparisons = [
         compare_recordings([measured[place].recording, after], chain_or_sink)
