@@ -145,7 +145,7 @@ import random, sys, time
 from chainshaper.enforcement.journal import open_journal
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.enforcement.scheduling_memory import change_all
-from chainshaper.linux.scheduling import Scheduling
+from chainshaper.linux.scheduling import SchedulingRequest
 from chainshaper.linux.threads import list_threads
 
 journal = open_journal(sys.argv[2])
@@ -153,7 +153,7 @@ cores = available_cores()
 print("ready", flush=True)
 while True:
     for thread in list_threads(int(sys.argv[1])):
-        wanted = Scheduling(random.randint(1, 20), (random.choice(cores),))
+        wanted = SchedulingRequest(random.randint(1, 20), (random.choice(cores),))
         change_all(journal, [(thread, wanted)])
 """
 

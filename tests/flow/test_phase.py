@@ -23,7 +23,6 @@ from hypothesis import strategies as st
 from processes import wait_for
 
 from chainshaper.enforcement.undoing import RunState
-from chainshaper.flow import apply as applying
 from chainshaper.flow import phase
 from chainshaper.flow.phase import (
     NO_NODE,
@@ -34,6 +33,7 @@ from chainshaper.flow.phase import (
     measure_phase,
     watch_wake_ups,
 )
+from chainshaper.flow.plan_in_force import phases, supervision, threads
 from chainshaper.planning import ChainPlan
 from chainshaper.sources.ros import Script
 from chainshaper.values.errors import OperationError
@@ -221,8 +221,9 @@ def applied(
     stop: threading.Event | None = None,
 ) -> Iterator[list[RunState]]:
     """The plan in force, with what was seen of its state; drift is looked for all the time."""
-    monkeypatch.setattr(applying, "tell_phase", lambda _plan, _found, phase_ns: tell(phase_ns))
-    monkeypatch.setattr(applying, "_LOOK_S", 0.2)
+    monkeypatch.setattr(phases, "tell_phase", lambda _plan, _found, phase_ns: tell(phase_ns))
+    monkeypatch.setattr(threads, "LOOK_S", 0.2)
+    monkeypatch.setattr(supervision, "LOOK_S", 0.2)
     monkeypatch.setattr(DriftWatch, "EVERY_S", 0.1)
     monkeypatch.setattr(DriftWatch, "CYCLES", 5)
     with applied_here(plan, folder / "runs", stop) as states:
