@@ -131,14 +131,19 @@ def test_a_node_that_is_started_again_is_no_second_path(
     assert sum(counted(seen[-1]).values()) == pytest.approx(one.begun(seen[-1]), abs=2)
 
 
+def look_at_two_that_run(watched: Simulated) -> Seen:
+    """Start nodes again beside those that run, which stay; return the last look at both."""
+    watched.go_on(10)
+    watched.stay = True
+    watched.start_again()
+    return watched.go_on(4)[-1]
+
+
 def test_two_that_run_with_the_same_names_stay_unclear(
     simulated: "Callable[..., Simulated]",
 ) -> None:
     one = simulated()
-    one.go_on(10)
-    one.stay = True
-    one.start_again()
-    unclear = one.go_on(4)[-1]
+    unclear = look_at_two_that_run(one)
     assert "paths match" in (unclear.chains[0].problem or "")
     assert counted(unclear)["incomplete"] <= one.application.cycles["incomplete"] + 4
 
@@ -182,10 +187,7 @@ def test_one_of_two_that_run_with_the_same_name_can_be_watched(
     simulated: "Callable[..., Simulated]",
 ) -> None:
     one = simulated()
-    one.go_on(10)
-    one.stay = True
-    one.start_again()
-    problem = one.go_on(4)[-1].chains[0].problem or ""
+    problem = look_at_two_that_run(one).chains[0].problem or ""
     assert "(write /a1../a2../a_2@" in problem, (
         "of several nodes twice no way point alone is enough"
     )

@@ -167,14 +167,14 @@ class _Watch:
                 self.page = CounterPage(run.page, run.table)
             except OSError:  # the owner is gone, which its pidfd will say
                 return False
-        for one in processes_of_role(self.journal, DISPATCHER):
-            if one.core is None or one.core in self.beats:
+        for dispatcher in processes_of_role(self.journal, DISPATCHER):
+            if dispatcher.core is None or dispatcher.core in self.beats:
                 continue
-            self.beats[one.core] = (-1, 0)
-            if (pidfd := open_process(one.pid, one.started)) is None:
+            self.beats[dispatcher.core] = (-1, 0)
+            if (pidfd := open_process(dispatcher.pid, dispatcher.started)) is None:
                 lost = True
             else:
-                self.cores[pidfd] = one.core
+                self.cores[pidfd] = dispatcher.core
                 self.poll.register(pidfd, select.POLLIN)
         elsewhere = self.available - set(self.cores.values())
         os.sched_setaffinity(0, elsewhere or self.available)

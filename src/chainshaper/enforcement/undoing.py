@@ -315,8 +315,10 @@ def _hasten(holder: LockHolder | None, waited_s: float) -> None:
 
 def _end_processes(journal: Journal, role: str) -> None:
     """Kill all processes of a role, this one excepted: one that was stopped hears nothing else."""
-    for one in processes_of_role(journal, role):
-        if one.pid != os.getpid() and (pidfd := open_process(one.pid, one.started)) is not None:
+    for process in processes_of_role(journal, role):
+        if process.pid == os.getpid():
+            continue
+        if (pidfd := open_process(process.pid, process.started)) is not None:
             with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(pidfd, signal.SIGKILL)
             os.close(pidfd)

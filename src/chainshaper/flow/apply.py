@@ -100,16 +100,16 @@ def apply_plan(
     node, a node does not appear, a chain has no regular beginning, the kernel refuses something,
     the servers failed, the application ended, or ``stop`` was set before the plan was in force.
     """
-    given, taken = plan, run_users(users)
-    threads.server_table(given)
-    check_cores({server.core: f"server {server.name}" for server in given.servers})
+    user_ids = run_users(users)
+    threads.server_table(plan)
+    check_cores({server.core: f"server {server.name}" for server in plan.servers})
     choice = choose_back_end(back_end)
-    threads.refuse_unfit(given, choice.name)
+    threads.refuse_unfit(plan, choice.name)
     reaches_ns, why_not = dict[int, tuple[int, int]](), list[str]()
     if adapt:
-        given, reaches_ns, why_not = threads.followed_chains(given, choice.name, max_latency_ns)
+        plan, reaches_ns, why_not = threads.followed_chains(plan, choice.name, max_latency_ns)
     # Looked up once: that takes longer than looking at processes.
-    recordings, unread = threads.evidence_of(given, recording)
+    recordings, unread = threads.evidence_of(plan, recording)
     recorded, unread = threads.recorded_in(recordings, unread)
     stop = stop or threading.Event()
 
@@ -117,10 +117,10 @@ def apply_plan(
         if stop.is_set():
             raise OperationError("the run was asked to end before the plan was in force")
 
-    journal = _claim(given, folder, go_on)
+    journal = _claim(plan, folder, go_on)
     run = _Run(journal)
-    found = RunThreads(journal, recorded, taken, unread)
-    anchored = AnchoredPlan(given, given, choice.name)
+    found = RunThreads(journal, recorded, user_ids, unread)
+    anchored = AnchoredPlan(plan, plan, choice.name)
     if wait_ns is None:
         wait_ns = START_NS if command else 0
     try:
@@ -128,13 +128,13 @@ def apply_plan(
         if command:
             run.command = start_command(command, stdout=command_stdout)
         await_nodes(
-            found, given, wait_ns, command=run.command, stop=stop, go_on=go_on, progress=progress
+            found, plan, wait_ns, command=run.command, stop=stop, go_on=go_on, progress=progress
         )
         run.guardians.await_ready(go_on)
-        notes = _schedule(found, given, choice.name, recordings)
-        report = _begin_report(journal, choice, given, command, plan_path)
+        notes = _schedule(found, plan, choice.name, recordings)
+        report = _begin_report(journal, choice, plan, command, plan_path)
         note_strangers(report, found.latest)
-        note_absent(report, given, found.latest, found.unread)
+        note_absent(report, plan, found.latest, found.unread)
         report.note(*notes, *(note for note in found.latest.notes if note.endswith(IN_ORDER)))
         _find_anchor(anchored, found, report, phase_ns, go_on=go_on, progress=progress)
         table = threads.server_table(anchored.plan)

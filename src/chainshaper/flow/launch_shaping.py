@@ -135,7 +135,7 @@ def shape_launch(
         modes=request.modes,
         mode_recordings=mode_recordings or {},
     )
-    notes = [] if may_use_fifo() else [NOT_PERMITTED]
+    notes: list[str] = []
     measured = _measured(
         recorder,
         shaped,
@@ -230,9 +230,12 @@ def _measured(
 ) -> dict[int, _MeasuredChain]:
     """Record the chains under the profiling condition; what was measured, by place in ``wanted``.
 
-    Chains that would delay each other are recorded one after the other. Notes of the recordings
-    are added to ``notes``.
+    Chains that would delay each other are recorded one after the other. ``notes`` gets the notes of
+    the recordings, and a first one if SCHED_FIFO is not permitted.
     """
+    permitted = may_use_fifo()
+    if not permitted:
+        notes.append(NOT_PERMITTED)
     measured: dict[int, _MeasuredChain] = {}
     for number, places in enumerate(undelayed(look.profiles, look.core_of), start=1):
         chains = [look.wanted[place] for place in places]
@@ -249,7 +252,7 @@ def _measured(
             "before" if number == 1 else f"before_{number}",
             command,
             duration_ns,
-            scheduling=condition if may_use_fifo() else None,
+            scheduling=condition if permitted else None,
             chain=chains[0],
         )
         notes += before.info.notes

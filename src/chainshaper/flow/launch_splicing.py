@@ -135,7 +135,10 @@ def splice_launch_files(
     if recording is not None:
         serialized = [one.output for _, one, _ in every if kinds.get(one.name) in _SERIALIZED]
         _refuse_undelivered(recording, {output: types.get(output, "") for output in serialized})
-    logs = {one.name: folder / launching.LOGS / f"{one.name}.csv" for one in plan.shaping_nodes}
+    logs = {
+        shaping.name: folder / launching.LOGS / f"{shaping.name}.csv"
+        for shaping in plan.shaping_nodes
+    }
 
     def written(into: Path) -> _Written:
         made, blocks = list[ShapingProcess](), list[str]()

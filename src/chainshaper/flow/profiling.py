@@ -97,7 +97,7 @@ def profiling_condition(
         around = scheduling_around(
             *(at_home, servers.values(), found, available_cores()), order=order, clear=clear
         )
-        wishes = [(one.node_thread.thread, one.scheduling) for one in around]
+        wishes = [(wanted.node_thread.thread, wanted.scheduling) for wanted in around]
         wishes += [
             (one.thread, SchedulingRequest(0, (best_effort[node],)))
             for one in found.threads

@@ -113,8 +113,8 @@ def find_threads(
     else:
         found = allocate(running.find_applications(processes), recorded, processes, taken)
         nodes = defaultdict[int, set[str]](set)
-        for one in with_gates(found, shaping).threads:
-            nodes[one.thread.pid].update(one.nodes)
+        for listed in with_gates(found, shaping).threads:
+            nodes[listed.thread.pid].update(listed.nodes)
         planned = {thread.node: server.name for server in servers for thread in server.threads}
         hosted, chosen = None, [p for p in processes if nodes[p.pid] or p.participates]
         if plan is not None:  # receivers need not run
@@ -449,7 +449,7 @@ def first_threads(plan: Plan, found: Allocation) -> list[tuple[RunningThread, ..
                 f"no server of {chain_name(chain)} holds an executor, so nothing says where in a"
                 " cycle the chain begins: give its phase (--phase)"
             )
-        begin.append(tuple(one.thread for one in threads_for(planned, found)))
+        begin.append(tuple(listed.thread for listed in threads_for(planned, found)))
     return begin
 
 

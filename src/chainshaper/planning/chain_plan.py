@@ -398,7 +398,9 @@ def output_server(plan: ChainPlan) -> Server | None:
         server = server_of(plan, plan.shaping_node.thread)
     elif plan.chain.publisher is not None:
         server = server_of(plan, Thread(node=plan.chain.publisher, role="publisher"))
-    return server or next((other for other in plan.servers if other.name == "output"), None)
+    if server is not None:
+        return server
+    return next((server for server in plan.servers if server.name == "output"), None)
 
 
 def publish_slots(plan: ChainPlan) -> tuple[Slot, ...]:
@@ -429,7 +431,9 @@ def publishing_servers(plan: ChainPlan) -> tuple[Server, ...]:
 def running_servers(plan: ChainPlan) -> list[Server]:
     """The servers that run the chain: in which nothing is published, and none for best effort."""
     publishing = publishing_servers(plan)
-    return [one for one in plan.servers if one not in publishing and not one.best_effort]
+    return [
+        server for server in plan.servers if server not in publishing and not server.best_effort
+    ]
 
 
 def with_slots(

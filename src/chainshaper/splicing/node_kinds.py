@@ -48,9 +48,10 @@ def kind_of(
         return "python", "in Python"
     if message_type is None:
         return "generic", "in C++ for all types, since the type of the output is not known"
-    if within_container and headers_installed(message_type) is not False:
+    installed = headers_installed(message_type)  # None: no ROS 2 is sourced that could say
+    if within_container and installed is not False:
         return "component", "a component in C++, since the container of the publisher can load it"
-    if headers_installed(message_type):
+    if installed:
         return "typed", f"in C++ for {message_type}, whose headers are installed"
     return "generic", f"in C++ for all types, since no headers of {message_type} are installed here"
 
