@@ -79,7 +79,7 @@ class BackEnd(ABC):
         """
 
     def in_force_from(self) -> int | None:
-        """Return when the latest ``arm`` began to be enforced (CLOCK_MONOTONIC, ns); None: never."""
+        """Return since when the latest ``arm`` is enforced (CLOCK_MONOTONIC, ns); None: never."""
         return self._since_ns
 
     def counters(self) -> dict[str, ServerCounters]:

@@ -236,7 +236,7 @@ def in_all_places(counters: Sequence[ServerCounters]) -> ServerCounters:
 
 
 def unpack_exit(value: bytes) -> str | None:
-    """Read the element of the map `ended`: why the kernel has ended the policy; None: it has not."""
+    """Read the element of the map `ended`: why the kernel has ended the policy, or None."""
     kind, *texts = EXIT.unpack(value)
     said = [text.split(b"\0", 1)[0].decode(errors="replace") for text in texts]
     return ": ".join(filter(None, said)) if kind else None
