@@ -264,7 +264,7 @@ class CallbackDescription(Part):
 
     @property
     def subscriptions(self) -> tuple[str, ...]:
-        """All topics that are subscribed to for this callback: that of the gate's modes is first."""
+        """All topics that are subscribed to for this callback, that of the gate's modes first."""
         if self.gate is None or self.gate.modes is None:
             return self.inputs
         return (self.gate.modes.topic, *self.inputs)
