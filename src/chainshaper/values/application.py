@@ -127,7 +127,7 @@ class ApplicationGraph:
         return f"{self.node_text(callback)}{callback.label.removeprefix(callback.node)}"
 
     def node_text(self, callback: Callback) -> str:
-        """Return the callback's node as a way point: ``/talker``, or ``/talker@4711`` of several."""
+        """Return the node as a way point: ``/talker``, or ``/talker@4711`` of several at once."""
         pids = {namesake.pid for namesake in self.callbacks if namesake.node == callback.node}
         pids |= {namesake.pid for namesake in self.nodes if namesake.name == callback.node}
         return f"{callback.node}@{callback.pid}" if len(pids) > 1 else callback.node
