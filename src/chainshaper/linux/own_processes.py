@@ -87,7 +87,7 @@ def start_module(
     stderr: int = subprocess.PIPE,
     pass_fds: Collection[int] = (),
 ) -> "subprocess.Popen[bytes]":
-    """Start a module as a process of our own; by default there are pipes from its output and errors.
+    """Start a module as a process of our own, by default with pipes from its output and errors.
 
     ``stdin``, ``stdout``, ``stderr`` and ``pass_fds`` are as for Popen.
     """
@@ -107,7 +107,7 @@ def named_folders() -> list[str]:
 
 
 def tool_environment() -> dict[str, str]:
-    """Return our environment for tools that we run, with a PATH independent of the current folder."""
+    """Return our environment for tools that we run; its PATH has no relative folder."""
     folders = filter(os.path.isabs, os.environ.get("PATH", "").split(os.pathsep))
     return {**os.environ, "PATH": os.pathsep.join(folders) or os.defpath}
 

@@ -122,7 +122,7 @@ def state_from_json(values: dict[str, Any]) -> SchedulingState:
 
 
 def apply_scheduling(thread: RunningThread, wanted: SchedulingRequest) -> None:
-    """Give a thread class and cores, if it still runs. Raises OperationError: the kernel refuses."""
+    """Give a running thread class and cores. Raises OperationError: the kernel refuses."""
     try:
         set_state(thread.tid, after_wish(state_of(thread.tid), wanted))
     except ProcessLookupError:
