@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from chainshaper import _core
 from chainshaper.planning import chain_plan as plans
 from chainshaper.planning.chain_plan import ChainPlan, Prediction, Slot, publish_slots
-from chainshaper.planning.margins import check_latencies
+from chainshaper.planning.latencies import check_latencies
 from chainshaper.robot.gate import IntoOpenSlot
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, extra_library

@@ -289,7 +289,7 @@ class Modes(Part):
 
 
 class Adaptation(Part):
-    """How slots follow the latencies of what runs (:class:`~chainshaper.planning.margins.Tail`).
+    """How slots follow the latencies of what runs (:class:`~chainshaper.planning.adaptation.Tail`).
 
     They move later when ``late`` times the promised share of the last ``window`` cycles would have
     been late in them; earlier where that has taken at least the share ``gain`` off the latency for

@@ -14,7 +14,8 @@ from typing import NamedTuple
 
 from chainshaper.planning import chain_plan as plans
 from chainshaper.planning.chain_plan import PER_CALLBACK, ChainPlan, ShapingNode, Slot, Thread
-from chainshaper.planning.margins import OVERRUN_PROBABILITY, cycles_needed
+from chainshaper.planning.late_shares import cycles_needed
+from chainshaper.planning.margins import OVERRUN_PROBABILITY
 from chainshaper.values.durations import duration_text, milliseconds
 from chainshaper.values.errors import InputError
 

@@ -35,6 +35,7 @@ from chainshaper.planning.chain_plan import (
     Slot,
 )
 from chainshaper.planning.cores import assign_cores
+from chainshaper.planning.latencies import check_latencies
 from chainshaper.planning.offsets import refuse_common
 from chainshaper.planning.pipeline import Work, pipelined, stage_places, work_of
 from chainshaper.planning.profile import (
@@ -120,7 +121,7 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
             raise OperationError(
                 f"the {both} {reason}: plan with a shorter slot, or smaller margin"
             )
-        latencies = np.minimum(margins.check_latencies(profile.latencies_ns), most)
+        latencies = np.minimum(check_latencies(profile.latencies_ns), most)
         measured = replace(profile, latencies_ns=latencies)
     plan = finish(_shaped(measured, request, margin, sinks))
     if request.policy in OWN_SLOTS:
@@ -252,9 +253,8 @@ def cores_for(
             raise InputError(f"{reason}: plan from a recording")
     if request.policy == "pipelined":
         return {node: cores[k] for node, k in _places(profiles, cores).items()}
-    least = margins.least_epsilon_ns(request.publication)
-    margin = least if request.epsilon_ns is None else request.epsilon_ns
-    return assign_cores(profiles, cores, margin_ns=margin, worth=worth)
+    margin_ns = margins.given_or_least_epsilon_ns(request)
+    return assign_cores(profiles, cores, margin_ns=margin_ns, worth=worth)
 
 
 def on_cores(
@@ -308,20 +308,17 @@ def _covered(profile: Profile, request: PlanRequest) -> Profile:
     if request.percentile is not None:  # what takes longer has been left out
         return profile
     every = profile.every
-    covered = every[every <= _covering(every, profile, request)]
+    latest_slot_ns = _latest_slot_ns(profile, request)
+    covered = every[every <= margins.covering_latency(every, request, latest_slot_ns)]
     latencies = covered if covered.size > 1 else every  # none fits, which the planner refuses
     return replace(profile, latencies_ns=latencies, every_latency_ns=every)
 
 
-def _covering(latencies: NDArray[np.int64], profile: Profile, request: PlanRequest) -> int:
-    """The latency that covers all of these but the promised share, as far as a publish slot fits
-    into the cycle behind it.
-    """
-    least_ns = margins.least_epsilon_ns(request.publication) + _slot_ns(profile, request)
-    latest = None if request.policy in OWN_SLOTS else profile.period_ns - least_ns
-    share = request.overrun_probability or margins.OVERRUN_PROBABILITY
-    independent = margins.independent_cycles(latencies)
-    return margins.covered_latency(latencies, share, latest, independent)
+def _latest_slot_ns(profile: Profile, request: PlanRequest) -> int | None:
+    """Return when the publish slot has to begin to end in the cycle; None: the policy places it."""
+    if request.policy in OWN_SLOTS:
+        return None
+    return profile.period_ns - _slot_ns(profile, request)
 
 
 def _slot_ns(profile: Profile, request: PlanRequest) -> int:
@@ -463,76 +460,14 @@ def _shaped(
 
 
 def _margin(profile: Profile, request: PlanRequest) -> Margin:
-    every, longest, probability = profile.every, profile.longest_ns, request.overrun_probability
-    independent = margins.independent_cycles(every)
-    clustered = independent if independent < every.size else None
-    if request.epsilon_ns is not None:
-        if request.epsilon_ns < 0:
-            raise InputError("epsilon must be 0 ms or more")
-        way = 0 if request.publication == "in-process" else margins.HOP_NS
-        in_time = longest + max(0, request.epsilon_ns - way)
-        late = margins.late_share(every, in_time, independent)
-        return Margin(
-            epsilon_ns=request.epsilon_ns, overrun_probability=late, independent_cycles=clustered
-        )
-    covered = profile.latencies_ns if request.ideal_machine else every
-    # No margin covers cycles for a slot that stands elsewhere, or those that have been left out.
-    covers = request.policy not in OWN_SLOTS or request.policy == "pipelined"
-    covers &= request.percentile is None
-    if probability is not None and covers:
-        return _asked_margin(covered, profile, request, probability, independent)
-    stalls = max(0, _covering(covered, profile, request) - longest) if covers else 0
-    all_covered = covers and not request.ideal_machine
-    late = _late_by_default(every, longest, stalls, independent, all_covered=all_covered)
-    if probability is not None and late > probability:
-        reason = f"up to {late:.2g} of the outputs will be late, more than {probability:g}"
-        remedy = "the margin covers no share with --percentile, nor where slots are a policy's own"
-        raise OperationError(f"{reason}: {remedy}. Leave out --overrun-probability")
-    return Margin(
-        epsilon_ns=margins.least_epsilon_ns(request.publication) + stalls,
-        source="measured",
-        overrun_probability=late,
-        stalls_ns=stalls,
-        independent_cycles=clustered,
+    """Return the margin behind the longest latency that a chain is planned from."""
+    return margins.planned_margin(
+        profile.latencies_ns,
+        profile.every,
+        request,
+        latest_slot_ns=_latest_slot_ns(profile, request),
+        decides_slot=request.policy not in OWN_SLOTS or request.policy == "pipelined",
     )
-
-
-def _asked_margin(
-    covered: NDArray[np.int64],
-    profile: Profile,
-    request: PlanRequest,
-    probability: float,
-    independent: int,
-) -> Margin:
-    """The margin for a share of late outputs that was asked for, of the cycles that are covered;
-    where others are late besides, with the share of all."""
-    longest, least = profile.longest_ns, margins.least_epsilon_ns(request.publication)
-    margin = margins.derive_margin(
-        covered, probability, request.seed, longest_ns=longest, least_ns=least
-    )
-    in_time = longest + margin.epsilon_ns - least
-    if not request.ideal_machine or not np.any(profile.every > in_time):
-        return margin
-    late = margins.late_share(profile.every, in_time, independent)
-    return margin.model_copy(update={"overrun_probability": late})
-
-
-def _late_by_default(
-    every: NDArray[np.int64], longest: int, stalls: int, independent: int, *, all_covered: bool
-) -> float:
-    """The share of outputs that will be late where the least margin is behind ``longest + stalls``.
-
-    It is counted from the latencies themselves: what the least margin adds is the way to the
-    shaping node, and how many cycles end within it is an accident of the sample. Where the usual
-    share is covered, that is promised, or what is smaller by a confidence that leaves no doubt.
-    """
-    usual = margins.OVERRUN_PROBABILITY
-    if all_covered and independent >= margins.cycles_needed(usual):
-        rank = margins.covering_rank(independent, usual)  # fixed before the sample was seen
-        if longest + stalls >= np.sort(every)[-rank]:
-            beyond = rank - 1 if stalls else int(np.count_nonzero(every > longest))
-            return min(usual, margins.most_probable(beyond, independent, margins.WELL_COVERED))
-    return margins.late_share(every, longest + stalls, independent)
 
 
 def _with_policy(plan: ChainPlan, profile: Profile, request: PlanRequest) -> ChainPlan:
@@ -573,10 +508,7 @@ def refuse_contradictions(request: PlanRequest, *, sinks: bool, modes: bool) -> 
     if request.bands_of_modes == "found" and not (modes and request.policy == "shaped"):
         reason = "nothing says which mode was in force while latencies were measured"
         raise InputError(f"{reason}: add --mode-profile MODE=REC, or say what `announces` them")
-    if request.epsilon_ns is not None and request.overrun_probability is not None:
-        raise InputError("the margin is either given or covers a share: leave out one of both")
-    if (share := request.overrun_probability) is not None and not 0 < share < 1:
-        raise InputError(f"an overrun probability of {share}: write one between 0 and 1")
+    margins.refuse_contradictory_margin(request)
     if request.policy != "one-long-slot" and request.slot_start_ns is not None:
         raise InputError("a slot's start goes with the policy one-long-slot: add it")
     cores = request.cores or ()

@@ -26,7 +26,8 @@ from chainshaper.planning.chain_plan import (
     Slot,
     Thread,
 )
-from chainshaper.planning.margins import check_latencies, least_epsilon_ns
+from chainshaper.planning.latencies import check_latencies
+from chainshaper.planning.margins import given_or_least_epsilon_ns
 from chainshaper.planning.overruns import united
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
@@ -74,9 +75,7 @@ def plan_shaping(
     wishes = replace(wishes or Wishes(), **{n: values.pop(n) for n in _WISHES & values.keys()})
     length = plans.SHORTEST_SLOT_NS if wishes.publish_slot_ns is None else wishes.publish_slot_ns
     longest = int(latencies.max())
-    least = least_epsilon_ns(wishes.publication)
-    given = least if wishes.epsilon_ns is None else wishes.epsilon_ns
-    epsilon = given if margin is None else margin.epsilon_ns
+    epsilon = given_or_least_epsilon_ns(wishes) if margin is None else margin.epsilon_ns
     if epsilon < 0 or length <= 0 or period_ns <= 0:
         found = ", ".join(map(duration_text, (epsilon, length, period_ns)))
         raise InputError(f"epsilon must be 0 ms or more, slot and period longer than 0 ms: {found}")
