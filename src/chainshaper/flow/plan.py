@@ -31,7 +31,7 @@ from chainshaper.analysis.disturbance import overlapping, stalled_within
 from chainshaper.analysis.graph import goes_on_elsewhere
 from chainshaper.analysis.latency import Executor
 from chainshaper.planning import CallbackTimes, Modes, Plan, PlanRequest, Profile, plan_chain
-from chainshaper.planning.margins import read_latencies
+from chainshaper.planning.latencies import read_latencies
 from chainshaper.planning.profile import UNKNOWN, Interfering, Reception
 from chainshaper.planning.request import DEFAULT_CORE
 from chainshaper.values import events
