@@ -24,7 +24,6 @@ ALLOWED_PARAMETERS = {
 
 ALLOWED_LENGTH = {
     "flow/apply.py: apply_plan": "a run from its claim to its end, in order: each line is a step",
-    "flow/launch_splicing.py: splice_launch_files": "to be cut",
     "flow/plan.py: _profile_of": "to be cut: it makes one value of 37 fields",
     "workload/live.py: run_application": "to be cut: it holds the order of a whole live run",
 }
