@@ -28,6 +28,7 @@ ALLOWED_LENGTH = {
     "workload/live.py: run_application": "to be cut: it holds the order of a whole live run",
 }
 
+
 class Measured(NamedTuple):
     name: str  # "FILE: FUNCTION"
     parameters: int
