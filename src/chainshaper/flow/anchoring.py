@@ -117,11 +117,11 @@ def placed(plan: Plan, phases: Sequence[Phase], *, gated: bool = True) -> tuple[
     groups = linked(len(cores), [(j, k) for j, k in pairs if cores[j] & cores[k]])
     chains, first_ns = list(plan.chains), None
     for group in groups:
-        group_chains = [chains[place] for place in group]
+        of_group = [chains[place] for place in group]
         group_phases = [phases[place] for place in group]
-        group_chains, anchor_ns = _placed_on_shared_cores(group_chains, group_phases, gated)
+        placed_chains, anchor_ns = _placed_on_shared_cores(of_group, group_phases, gated)
         first_ns = anchor_ns if first_ns is None else first_ns
-        for place, chain in zip(group, group_chains, strict=True):
+        for place, chain in zip(group, placed_chains, strict=True):
             offset_ns = (chain.offset_ns + anchor_ns - first_ns) % chain.cycle_ns
             chains[place] = revised(chain, offset_ns=offset_ns)
     return Plan.of(*chains), first_ns or 0
