@@ -79,7 +79,7 @@ class GateCallback:
             self._let_one_pass()
 
     def work_off(self) -> bool:
-        """Hold the messages that came meanwhile, as long as one is due; return whether more wait."""
+        """Hold messages that came meanwhile, as long as one is due; return whether more wait."""
         served = False
         while self._waiting and not (served and self._shaper.nothing_due()):
             self._record_take(self._handles.rmw_subscription, self._waiting[0].about)

@@ -114,7 +114,7 @@ class NodeProcess:
     def _work(
         self, index: int, callback: CallbackDescription, publishers: Sequence[TracedPublisher]
     ) -> executor.Work:
-        """Return what a callback does before it publishes: call a function, or spend drawn times."""
+        """Return what a callback does before it publishes: a function, or drawn times spent."""
         if callback.computes is not None:
             function = executor.load_function(callback.computes)
             return executor.computing(callback.computes, function, len(publishers))
