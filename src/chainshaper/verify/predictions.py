@@ -29,7 +29,7 @@ from chainshaper.analysis import LatencyAnalysis, LatencyStatistics, latency_sta
 from chainshaper.analysis.disturbance import Due
 from chainshaper.planning import ChainPlan, publish_slots
 from chainshaper.planning.chain_plan import SHORTEST_SLOT_NS, Slot, publisher_servers, server_of
-from chainshaper.planning.margins import OVERRUN_PROBABILITY
+from chainshaper.planning.margins import OVERRUN_PROBABILITY, allowed_late_share
 from chainshaper.planning.overruns import (
     GATE_NS,
     STOPPED_THREAD_NS,
@@ -258,7 +258,7 @@ def _receivers(
     place = pl.col("place_ns" if from_cycle else "latency_ns")
     known = analysis.traversals.filter(in_time).drop_nulls("reception_ns")
     at = known.select(place + pl.col("reception_ns") - pl.col("latency_ns")).to_series()
-    share = max(OVERRUN_PROBABILITY, plan.margin.overrun_probability or 0.0)
+    share = max(OVERRUN_PROBABILITY, allowed_late_share(plan.margin))
     statistics = latency_statistics(at)
     return JudgedReceivers(
         predicted_max_ns=promised.max_ns,
@@ -295,7 +295,7 @@ def _figures(
             if (1 - share) ** measured.count <= MISSING
         ] or starts[:1]
         lowest_max, lowest_jitter = sure[-1], sure[-1] - sure[0]
-        if plan.into_open_slot == "next-slot":  # a publication ends within the slot
+        if plan.into_open_slot == "next-slot":  # each output leaves within its slot
             publishing = ends[-1] - starts[-1]
     elif slots:
         longest, jitter = min(longest, slots[-1][0]), 0
