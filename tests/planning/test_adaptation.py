@@ -19,8 +19,8 @@ from scipy.special import bdtrc
 from small_chain import small_chain_plan
 
 from chainshaper.flow.drift import SlotFollower
-from chainshaper.flow.threads import followed_chains
-from chainshaper.planning import margins
+from chainshaper.flow.followed_chains import followed_chains
+from chainshaper.planning.adaptation import Tail
 from chainshaper.planning.chain_plan import (
     Adaptation,
     ChainPlan,
@@ -29,7 +29,7 @@ from chainshaper.planning.chain_plan import (
     revised,
     with_slots,
 )
-from chainshaper.planning.margins import Tail
+from chainshaper.planning.late_shares import most_hits
 from chainshaper.planning.plan import (
     Plan,
     open_until_done,
@@ -73,7 +73,7 @@ def follow(
     """The moves: behind which latency, and where to."""
     how = {"latest_ns": 10**9, "rules": RULES, **how}
     tail = Tail(how.pop("rules"), promised, round(start), float(np.median(latencies[:99])), **how)
-    return [(n, to) for n, one in enumerate(latencies) if (to := tail.saw(round(one))) is not None]
+    return [(n, to) for n, one in enumerate(latencies) if (to := tail.add(round(one))) is not None]
 
 
 def planned(shape: str, promised: float) -> float:
@@ -329,4 +329,4 @@ def test_counts_of_chance_are_those_of_the_binomial_distribution() -> None:
         sure = bdtrc(np.arange(trials + 1), trials, probability)
         for doubt in (1e-9, 1e-6, 0.5, 1 - 1e-6):
             expected = np.count_nonzero(sure > doubt)
-            assert margins._by_chance(trials, probability, doubt) == expected
+            assert most_hits(trials, probability, doubt) == expected

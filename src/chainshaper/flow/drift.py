@@ -22,8 +22,9 @@ from itertools import pairwise
 from statistics import mean, median
 
 from chainshaper.enforcement.undoing import SlotMove
+from chainshaper.planning.adaptation import Tail
 from chainshaper.planning.chain_plan import Adaptation, ChainPlan, publish_slots
-from chainshaper.planning.margins import OVERRUN_PROBABILITY, Tail
+from chainshaper.planning.margins import allowed_late_share
 from chainshaper.planning.offsets import chain_name
 from chainshaper.splicing.shaped_outputs import FollowedOutput
 from chainshaper.values.errors import ChainshaperError, OperationError
@@ -136,7 +137,7 @@ MOVES = 20  # so many of the latest moves are shown
 
 class SlotFollower:
     """Has the slots of a chain's output follow its latencies, which its gate's page of memory has
-    (:class:`~chainshaper.planning.margins.Tail`), in a thread of its own.
+    (:class:`~chainshaper.planning.adaptation.Tail`), in a thread of its own.
 
     ``pids`` are processes of which one may be the gate, ``reach_ns`` is how far slots may be moved.
     ``put_in_force`` has servers move theirs by so much, and says from when on the gate has to.
@@ -159,7 +160,7 @@ class SlotFollower:
         self._output = FollowedOutput(chain.shaping_node.output, pids)
         self._planned_ns = publish_slots(chain)[-1][0]
         earliest, latest = (self._planned_ns + by for by in reach_ns)
-        promised = chain.margin.overrun_probability or OVERRUN_PROBABILITY
+        promised = allowed_late_share(chain.margin)
         usual, rules = chain.evidence.mean_latency_ns, chain.adaptation or Adaptation()
         cycle_ns = math.inf if chain.policy == "pipelined" else chain.cycle_ns
         self._tail = Tail(rules, promised, self._planned_ns, usual, latest, earliest, cycle_ns)
@@ -181,7 +182,7 @@ class SlotFollower:
             while not self._stop.wait(look_s):
                 before_ns = self._tail.start_ns
                 for latency_ns in self._output.latencies():
-                    self._tail.saw(latency_ns)
+                    self._tail.add(latency_ns)
                 if self._tail.start_ns != before_ns:
                     self._move(self._tail.start_ns, before_ns)
         except ChainshaperError as error:  # also a place where slots may not be, beside others'

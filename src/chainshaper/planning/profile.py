@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.planning.chain_plan import PER_CALLBACK, SHORTEST_SLOT_NS, UNSHAPED
-from chainshaper.planning.margins import check_latencies
+from chainshaper.planning.latencies import check_latencies
 from chainshaper.planning.pipeline import finished
 from chainshaper.planning.shaping import CallbackTimes
 from chainshaper.values.durations import format_duration, milliseconds
@@ -425,30 +425,31 @@ def planned_cores(profiles: Sequence[Profile]) -> set[int]:
 def alone(profile: Profile) -> Profile:
     """The profile with what its callbacks took when nothing else ran; bare latencies as they are.
 
-    That is their sum, or, where branches join, the longest way: a callback of another chain that
-    delayed this one while it would have waited for its branch anyway has cost it nothing. Where a
-    branch begins by itself, at any time, nothing says what it would have waited for: then what
-    was measured stands.
+    That is their sum, or, where branches join, the longest way through them, with what branches
+    that share a core with it run on that core: a callback of another chain that delayed this one
+    while it would have waited for its branch anyway has cost it nothing. Where a branch begins by
+    itself, at any time, nothing says what it would have waited for: then what was measured stands.
     """
     if not profile.steps_ns.size or UNKNOWN in profile.begins_ns:
         return profile
     return replace(
         profile,
-        latencies_ns=_on_longest_way(profile, profile.steps_ns, profile.graph_steps_ns),
-        every_latency_ns=_on_longest_way(
+        latencies_ns=_without_others(profile, profile.steps_ns, profile.graph_steps_ns),
+        every_latency_ns=_without_others(
             profile, profile.every_step_ns, profile.every_graph_step_ns
         ),
         of_modes={mode: alone(one) for mode, one in profile.of_modes.items()},
     )
 
 
-def _on_longest_way(
+def _without_others(
     profile: Profile, steps_ns: NDArray[np.int64], graph_steps_ns: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     """When the output is done in each cycle, from what each callback took (a row per cycle)."""
     if graph_steps_ns.size:
         after = [callback.after for callback in profile.callbacks]
-        return finished(after, graph_steps_ns, profile.begins_ns)[:, -1]
+        cores = [callback.core for callback in profile.callbacks]
+        return finished(after, graph_steps_ns, profile.begins_ns, cores)[:, -1]
     along: NDArray[np.int64] = steps_ns.sum(axis=1)
     return along
 
