@@ -50,20 +50,55 @@ _Turn = tuple[int, int, int]  # stages a and b of one core, and how many cycles 
 
 
 def finished(
-    after: Sequence[Sequence[int]], steps_ns: NDArray[np.int64], begins_ns: Sequence[int]
+    after: Sequence[Sequence[int]],
+    steps_ns: NDArray[np.int64],
+    begins_ns: Sequence[int],
+    cores: Sequence[int] | None = None,
 ) -> NDArray[np.int64]:
-    """When each step of a graph is over, if it waits for no core: a row per instance, as in
-    ``steps_ns``, and a column per step.
+    """When each step of a graph is over at the latest: a row per instance, as in ``steps_ns``, and
+    a column per step (ns).
 
     A step comes behind all those ``after`` which it stands; one that stands after none begins
-    ``begins_ns`` behind its instance.
+    ``begins_ns`` behind its instance. With ``cores``, the core of each step, a step waits for its
+    core too, in whatever order the core runs what is ready: before it may come every step of the
+    same core that is neither before nor behind it in the graph. On one way through the graph each
+    of these is waited for once (Graham's bound for list scheduling, 1969, for fixed cores).
     """
+    beside = _beside(after, cores) if cores else [frozenset[int]()] * len(after)
     done = np.zeros_like(steps_ns)
+    waited_for: list[frozenset[int]] = []  # on every way to a step
     for step, inputs in enumerate(after):
-        ready = [done[:, before] for before in inputs]
-        start = np.max(ready, axis=0) if ready else begins_ns[step]
-        done[:, step] = start + steps_ns[:, step]
+        if not inputs:
+            core_free = steps_ns[:, sorted(beside[step])].sum(axis=1)
+            done[:, step] = begins_ns[step] + core_free + steps_ns[:, step]
+            waited_for.append(beside[step])
+            continue
+        for before in inputs:
+            once_more = sorted(beside[step] - waited_for[before])
+            ends = done[:, before] + steps_ns[:, once_more].sum(axis=1) + steps_ns[:, step]
+            done[:, step] = np.maximum(done[:, step], ends)
+        ways = (waited_for[before] | beside[step] for before in inputs)
+        waited_for.append(frozenset.intersection(*ways))
     return done
+
+
+def _beside(after: Sequence[Sequence[int]], cores: Sequence[int]) -> list[frozenset[int]]:
+    """For each step of a graph those of its core that may run before it or behind it."""
+    before: list[set[int]] = []
+    for inputs in after:
+        before.append(set(inputs).union(*(before[step] for step in inputs)))
+    steps = range(len(after))
+    return [
+        frozenset(
+            rival
+            for rival in steps
+            if cores[rival] == cores[step]
+            and rival != step
+            and rival not in before[step]
+            and step not in before[rival]
+        )
+        for step in steps
+    ]
 
 
 @dataclass(frozen=True)

@@ -446,7 +446,8 @@ def planned_cores(profiles: Sequence[Profile]) -> set[int]:
 def alone(profile: Profile) -> Profile:
     """Return the profile with what its callbacks took as if nothing else ran.
 
-    That is their sum, or, where branches join, the longest way: a callback of another chain that
+    That is their sum, or, where branches join, the longest way through them. On a core that
+    branches share with this way, what they run there is added. A callback of another chain that
     delayed this one while it would have waited for its branch anyway has cost it nothing. Where a
     branch begins by itself, at any time, nothing says what the chain would have waited for: then
     the latencies stay as they were measured. So do bare latencies.
@@ -455,21 +456,22 @@ def alone(profile: Profile) -> Profile:
         return profile
     return replace(
         profile,
-        latencies_ns=_on_longest_way(profile, profile.steps_ns, profile.graph_steps_ns),
-        every_latency_ns=_on_longest_way(
+        latencies_ns=_without_others(profile, profile.steps_ns, profile.graph_steps_ns),
+        every_latency_ns=_without_others(
             profile, profile.every_step_ns, profile.every_graph_step_ns
         ),
         of_modes={mode: alone(of_mode) for mode, of_mode in profile.of_modes.items()},
     )
 
 
-def _on_longest_way(
+def _without_others(
     profile: Profile, steps_ns: NDArray[np.int64], graph_steps_ns: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     """Return when the output is done in each cycle, from what each callback took (a row each)."""
     if graph_steps_ns.size:
         after = [callback.after for callback in profile.callbacks]
-        return finished(after, graph_steps_ns, profile.begins_ns)[:, -1]
+        cores = [callback.core for callback in profile.callbacks]
+        return finished(after, graph_steps_ns, profile.begins_ns, cores)[:, -1]
     along: NDArray[np.int64] = steps_ns.sum(axis=1)
     return along
 
