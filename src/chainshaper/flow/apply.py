@@ -27,7 +27,13 @@ from chainshaper.enforcement.scheduling_memory import look_alikes
 from chainshaper.enforcement.servers import BackEnd
 from chainshaper.enforcement.thread_scheduling import waiting_receivers
 from chainshaper.enforcement.undoing import RunState
-from chainshaper.flow import threads
+from chainshaper.flow.followed_chains import followed_chains
+from chainshaper.flow.plan_checks import (
+    check_publishers,
+    refuse_other_clocks,
+    refuse_simulated,
+    refuse_unfit,
+)
 from chainshaper.flow.plan_in_force.anchor import AnchoredPlan
 from chainshaper.flow.plan_in_force.followers import Followers
 from chainshaper.flow.plan_in_force.origins import OriginWatches
@@ -41,6 +47,8 @@ from chainshaper.flow.plan_in_force.threads import (
     note_absent,
     note_strangers,
 )
+from chainshaper.flow.recorded_processes import evidence_of, recorded_in
+from chainshaper.flow.server_tables import server_table
 from chainshaper.linux.own_processes import end_command, start_command
 from chainshaper.linux.processes import run_users
 from chainshaper.linux.scheduling import check_cores
@@ -101,16 +109,16 @@ def apply_plan(
     the servers failed, the application ended, or ``stop`` was set before the plan was in force.
     """
     user_ids = run_users(users)
-    threads.server_table(plan)
+    server_table(plan)
     check_cores({server.core: f"server {server.name}" for server in plan.servers})
     choice = choose_back_end(back_end)
-    threads.refuse_unfit(plan, choice.name)
+    refuse_unfit(plan, choice.name)
     reaches_ns, why_not = dict[int, tuple[int, int]](), list[str]()
     if adapt:
-        plan, reaches_ns, why_not = threads.followed_chains(plan, choice.name, max_latency_ns)
+        plan, reaches_ns, why_not = followed_chains(plan, choice.name, max_latency_ns)
     # Looked up once: that takes longer than looking at processes.
-    recordings, unread = threads.evidence_of(plan, recording)
-    recorded, unread = threads.recorded_in(recordings, unread)
+    recordings, unread = evidence_of(plan, recording)
+    recorded, unread = recorded_in(recordings, unread)
     stop = stop or threading.Event()
 
     def go_on() -> None:
@@ -137,7 +145,7 @@ def apply_plan(
         note_absent(report, plan, found.latest, found.unread)
         report.note(*notes, *(note for note in found.latest.notes if note.endswith(IN_ORDER)))
         _find_anchor(anchored, found, report, phase_ns, go_on=go_on, progress=progress)
-        table = threads.server_table(anchored.plan)
+        table = server_table(anchored.plan)
         servers = run.servers = make_back_end(choice.name, table, journal, go_on)
         followers = run.followers = Followers(anchored, servers)
         supervision = Supervision(
@@ -211,9 +219,9 @@ def _schedule(
 
     Returns what a person must know. Raises InputError, PlatformError: it does not fit.
     """
-    threads.refuse_simulated(plan, found.latest)
-    threads.refuse_other_clocks(plan, found.latest)
-    notes = threads.check_publishers(plan, found.latest, recordings)
+    refuse_simulated(plan, found.latest)
+    refuse_other_clocks(plan, found.latest)
+    notes = check_publishers(plan, found.latest, recordings)
     return notes + waiting_receivers(plan, found.schedule(plan, back_end))
 
 

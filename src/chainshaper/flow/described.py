@@ -10,8 +10,9 @@ from pathlib import Path
 from chainshaper.enforcement.back_ends import choose_back_end, make_back_end
 from chainshaper.enforcement.guardian import run_claimed
 from chainshaper.flow.drift import SlotFollower
+from chainshaper.flow.followed_chains import followed_chains
 from chainshaper.flow.plan import plan_recording
-from chainshaper.flow.threads import followed_chains, table_of
+from chainshaper.flow.server_tables import table_of
 from chainshaper.planning import ChainPlan, PlanRequest, save_plan
 from chainshaper.planning.chain_plan import Server, Thread
 from chainshaper.planning.plan import Plan, open_until_done

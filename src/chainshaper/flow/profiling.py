@@ -17,8 +17,9 @@ from chainshaper.enforcement.node_threads import Allocation, NodeThread, allocat
 from chainshaper.enforcement.scheduling_memory import change_all
 from chainshaper.enforcement.servers import ReservationServer
 from chainshaper.enforcement.thread_scheduling import scheduling_around
-from chainshaper.flow.plan import graph_stages, profile_chains, taking_part
-from chainshaper.flow.threads import recorded_processes
+from chainshaper.flow.plan import profile_chains
+from chainshaper.flow.recorded_processes import recorded_processes
+from chainshaper.flow.recorded_profile.stages import graph_stages, taking_part
 from chainshaper.linux.processes import RunningProcess
 from chainshaper.linux.scheduling import (
     SchedulingRequest,

@@ -24,7 +24,7 @@ from chainshaper.analysis.objects import resolve_objects
 from chainshaper.enforcement.journal import Governed, governing, in_force_throughout
 from chainshaper.enforcement.node_threads import allocate, strangers_text
 from chainshaper.flow.exploration import with_trace_events
-from chainshaper.flow.threads import recorded_processes
+from chainshaper.flow.recorded_processes import recorded_processes
 from chainshaper.linux import processes as running
 from chainshaper.linux.own_processes import check_command, end_command, end_in_words, start_command
 from chainshaper.linux.processes import RunningProcess, find_applications
