@@ -55,6 +55,7 @@ from chainshaper.linux.scheduling import check_cores
 from chainshaper.planning.offsets import LEAD_NS, chain_name
 from chainshaper.planning.overruns import publication_warnings
 from chainshaper.planning.plan import Plan
+from chainshaper.splicing.shaped_outputs import remove_abandoned_pages
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import OperationError
 from chainshaper.values.progress import Progress
@@ -201,6 +202,8 @@ class _Run:
         self.phases.end()
         if self.command is not None:
             end_command(self.command)
+        if self.command is not None or self.followers is not None:
+            remove_abandoned_pages()  # what a follower had open its own run has left
         put_back(self.journal, self.guardians, problems)
 
 
