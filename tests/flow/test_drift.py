@@ -32,8 +32,8 @@ from chainshaper.flow.plan_in_force.phases import PhaseMessages
 from chainshaper.flow.plan_in_force.supervision import Supervision
 from chainshaper.flow.plan_in_force.threads import RunThreads, assign_threads
 from chainshaper.linux.threads import RunningThread
+from chainshaper.planning.adaptation import Tail
 from chainshaper.planning.chain_plan import ChainPlan, revised
-from chainshaper.planning.margins import Tail
 from chainshaper.planning.plan import Plan, open_until_done
 from chainshaper.reporting.overviews import servers_table
 from chainshaper.splicing.shaped_outputs import FollowedOutput

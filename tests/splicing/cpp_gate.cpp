@@ -67,12 +67,15 @@ struct Outcome {
 void walk() {
   Queue<std::size_t> queue(read_gate());
   for (auto count = number(); count > 0; --count) {
-    const auto time = number();
-    queue.changes.emplace_back(time, static_cast<std::size_t>(number()));
-  }
-  for (auto count = number(); count > 0; --count) {
-    const auto time = number();
-    queue.moves.emplace_back(time, number());
+    const auto from_ns = number();
+    const auto what = number();  // in the order of `CHANGED`
+    const auto value = number();
+    if (what == 0)
+      queue.switch_mode(static_cast<std::size_t>(value), from_ns);
+    else if (what == 1)
+      queue.move_slots(value, from_ns);
+    else
+      queue.set_phase(value, from_ns);
   }
   std::deque<std::int64_t> steps;
   for (auto count = number(); count > 0; --count) steps.push_back(number());

@@ -22,8 +22,9 @@ from itertools import pairwise
 from statistics import mean, median
 
 from chainshaper.enforcement.undoing import SlotMove
+from chainshaper.planning.adaptation import Tail
 from chainshaper.planning.chain_plan import Adaptation, ChainPlan, publish_slots
-from chainshaper.planning.margins import OVERRUN_PROBABILITY, Tail
+from chainshaper.planning.margins import allowed_late_share
 from chainshaper.planning.offsets import chain_name
 from chainshaper.splicing.shaped_outputs import FollowedOutput
 from chainshaper.values.errors import ChainshaperError, OperationError
@@ -138,8 +139,9 @@ MOVES = 20  # so many of the latest moves are shown
 class SlotFollower:
     """Has the slots of a chain's output follow its latencies, in a thread of its own.
 
-    The gate's page of memory has the latencies; where slots shall be, they decide by
-    :class:`~chainshaper.planning.margins.Tail`. The thread may end by itself, with a ``failure``.
+    The gate's page of memory has the latencies, from which
+    :class:`~chainshaper.planning.adaptation.Tail` says where slots shall be. The thread may end by
+    itself, with a ``failure``.
 
     * ``pids``: processes of which one may be the gate.
     * ``reach_ns``: how far slots may be moved, earlier and later.
@@ -168,7 +170,7 @@ class SlotFollower:
         earliest_ns, latest_ns = (self._planned_ns + moved_ns for moved_ns in reach_ns)
         self._tail = Tail(
             chain.adaptation or Adaptation(),
-            chain.margin.overrun_probability or OVERRUN_PROBABILITY,
+            allowed_late_share(chain.margin),
             self._planned_ns,
             chain.evidence.mean_latency_ns,
             latest_ns,
@@ -194,7 +196,7 @@ class SlotFollower:
             while not self._stop.wait(look_s):
                 before_ns = self._tail.start_ns
                 for latency_ns in self._output.latencies():
-                    self._tail.saw(latency_ns)
+                    self._tail.add(latency_ns)
                 if self._tail.start_ns != before_ns:
                     self._move(self._tail.start_ns, before_ns)
         except ChainshaperError as error:  # also a place where slots may not be, beside others'

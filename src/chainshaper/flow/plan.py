@@ -12,7 +12,7 @@ from chainshaper.flow.recorded_profile.chain_profile import profile_of
 from chainshaper.flow.recorded_profile.modes import modes_in_force
 from chainshaper.flow.recorded_profile.stages import Stage, graph_stages
 from chainshaper.planning import Modes, Plan, PlanRequest, Profile, plan_chain
-from chainshaper.planning.margins import read_latencies
+from chainshaper.planning.latencies import read_latencies
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.planning.chain_plan import PER_CALLBACK, SHORTEST_SLOT_NS, UNSHAPED
-from chainshaper.planning.margins import check_latencies
+from chainshaper.planning.latencies import check_latencies
 from chainshaper.planning.pipeline import finished
 from chainshaper.planning.shaping import CallbackTimes
 from chainshaper.values.durations import format_duration, milliseconds

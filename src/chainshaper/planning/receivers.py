@@ -17,7 +17,6 @@ is free, and nothing is promised for them.
 from collections.abc import Sequence
 from dataclasses import replace
 
-from chainshaper.planning import margins
 from chainshaper.planning.chain_plan import (
     PER_CALLBACK,
     ChainPlan,
@@ -27,6 +26,7 @@ from chainshaper.planning.chain_plan import (
     revised,
     shaping_nodes,
 )
+from chainshaper.planning.margins import with_part_taken
 from chainshaper.planning.profile import GATE_TAKES_NS, Profile
 from chainshaper.planning.shaping import OUTPUT_PRIORITY
 
@@ -95,10 +95,7 @@ def _placed(
             return plan
         if _reaches_next_cycle(plan, time_ns + one.longest_ns):
             # They delay the next instance by so much, for which the margin is there.
-            longest_ns = profile.longest_ns + margin.epsilon_ns - time_ns
-            late = margins.late_share(profile.every, longest_ns, margin.independent_cycles or 0)
-            worse = max(late, margin.overrun_probability or 0.0)
-            margin = margin.model_copy(update={"overrun_probability": worse})
+            margin = with_part_taken(margin, profile.every, profile.longest_ns, time_ns)
         waits_ns += GATE_TAKES_NS
         waits_ns += sum(node_work_ns(plan, n) for n in nodes if n is not node and n.core == core)
     place = ReceiverPlace(core=core, priority=OUTPUT_PRIORITY, time_ns=time_ns)
