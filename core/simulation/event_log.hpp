@@ -80,6 +80,6 @@ private:
 };
 
 // Outcomes of an asynchronous publication, as `WORDS["outcome"]` there numbers them.
-enum class Outcome : std::int64_t { sent, expired, overwritten };
+enum class SendOutcome : std::int64_t { sent, expired, overwritten };
 
 }  // namespace chainshaper::simulation
