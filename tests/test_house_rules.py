@@ -25,7 +25,6 @@ ALLOWED_PARAMETERS = {
 ALLOWED_LENGTH = {
     "flow/apply.py: apply_plan": "a run from its claim to its end, in order: each line is a step",
     "flow/recorded_profile/chain_profile.py: profile_of": "it makes one value of 37 fields",
-    "workload/live.py: run_application": "to be cut: it holds the order of a whole live run",
 }
 
 

@@ -39,6 +39,7 @@ def launch(in_ros2: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> li
 
 @pytest.mark.ros2
 @pytest.mark.timeout(300)
+@pytest.mark.usefixtures("lttng_of_ros2")
 def test_events_are_those_of_lttng_one_by_one(
     launch: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -84,6 +85,7 @@ def cut(table: pl.DataFrame) -> pl.DataFrame:
 
 @pytest.mark.ros2
 @pytest.mark.timeout(300)
+@pytest.mark.usefixtures("lttng_of_ros2")
 def test_what_is_watched_is_what_lttng_records(
     launch: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
