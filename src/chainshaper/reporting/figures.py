@@ -101,8 +101,8 @@ def draw_distribution(measurements: Sequence[Measurement], path: str | Path) -> 
         axes.step(latency, share, where="post", color=colour, label=label)
         slots = () if measurement.plan is None else slots_of_latency(measurement.plan)
         for number, (start, end) in enumerate(slots):
-            label = None if number else "publish slot"  # once in the legend
-            axes.axvspan(start / 1e6, end / 1e6, color="0.8", zorder=0, label=label)
+            in_legend = None if number else "publish slot"  # once
+            axes.axvspan(start / 1e6, end / 1e6, color="0.8", zorder=0, label=in_legend)
     axes.set(xlabel="end-to-end latency [ms]", ylabel="share of cycles")
     return _save_chain(figure, axes, measurements, path, vertical=False)
 

@@ -374,7 +374,7 @@ class Turn:
 
         From now on the page shows each of its decisions, and changes its schedule.
         """
-        modes = [] if shaper.gate.modes is None else [*shaper.gate.modes.bands]
+        modes = [] if shaper.gate.modes is None else [*shaper.gate.modes.slots]
         queue, cycle_ns = shaper.queue, shaper.gate.cycle_ns
 
         def decided(release: Release) -> None:

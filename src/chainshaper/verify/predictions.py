@@ -295,7 +295,7 @@ def _figures(
             if (1 - share) ** measured.count <= MISSING
         ] or starts[:1]
         lowest_max, lowest_jitter = sure[-1], sure[-1] - sure[0]
-        if plan.into_open_slot == "next-slot":  # a publication ends within the slot
+        if plan.into_open_slot == "next-slot":  # each output leaves within its slot
             publishing = ends[-1] - starts[-1]
     elif slots:
         longest, jitter = min(longest, slots[-1][0]), 0

@@ -19,11 +19,11 @@ from collections.abc import Iterator
 from dataclasses import MISSING, fields, replace
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_origin
 
 from pydantic import Field, create_model, model_validator
 
-from chainshaper.robot.gate import AtLeast, Gate, Late, Modes
+from chainshaper.robot.gate import Gate, GateModes, Late, limit_of
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Publication
 from chainshaper.values.yaml_file import (
@@ -126,7 +126,11 @@ class SimulationDescription(Part):
 
 
 class ModesDescription(Part):
-    """A gate's :class:`~chainshaper.robot.gate.Modes` and the ``topic`` that names the mode."""
+    """The modes of a gate, as :class:`~chainshaper.robot.gate.GateModes` has them.
+
+    * ``topic``: where modes are announced.
+    * ``bands``: which slot each mode has, from 1.
+    """
 
     topic: FullName
     bands: Annotated[dict[str, int], Field(min_length=1)]
@@ -138,15 +142,14 @@ def _gate_fields() -> dict[str, Any]:
     """Return the fields of a gate's description, from those that ``Gate`` declares."""
     described: dict[str, Any] = {}
     for declared in fields(Gate):
-        limits = get_args(declared.type)
-        least = next((limit.number for limit in limits if isinstance(limit, AtLeast)), None)
+        limit = limit_of(declared)
         type_: Any = Any  # slots and modes: `GateDescription` has types of its own for them
         if get_origin(declared.type) is Literal:
             type_ = declared.type
         elif declared.name.endswith("_ns"):
-            type_ = PositiveDuration if least == 1 else Duration
-        elif least is not None:
-            type_ = Annotated[int, Field(ge=least)]
+            type_ = PositiveDuration if limit and limit.number == 1 else Duration
+        elif limit is not None:
+            type_ = Annotated[int, Field(ge=limit.number)]
         default = ... if declared.default is MISSING else declared.default
         described[declared.name] = (type_, default)
     return described
@@ -207,7 +210,8 @@ class GateDescription(_DescribedGate):
         gate, modes = self._without_modes(), self.modes
         if modes is None:
             return gate
-        return replace(gate, modes=Modes(modes.bands, modes.default, modes.late))
+        slots = {mode: band - 1 for mode, band in modes.bands.items()}
+        return replace(gate, modes=GateModes(slots, modes.default, modes.late))
 
     def _without_modes(self) -> Gate:
         values = {declared.name: getattr(self, declared.name) for declared in fields(Gate)}

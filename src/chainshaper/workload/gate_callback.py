@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 from chainshaper.robot.clear_core import ClearCore
 from chainshaper.robot.handover import Turn
@@ -25,7 +24,7 @@ def shaper_of(
         clear_until = ClearCore(delivery_core).clear_until
         shaper.on_waking = lambda release_ns: clear_until(release_ns + gate.pause_ns)
     if turn is not None:
-        shaper.follow = partial(turn.follow, shaper.queue)
+        shaper.moved = turn.moved
     return shaper
 
 
@@ -79,7 +78,7 @@ class GateCallback:
             self._let_one_pass()
 
     def work_off(self) -> bool:
-        """Hold the messages that came meanwhile, as long as one is due; return whether more wait."""
+        """Hold the messages that came meanwhile while one is due; return whether more wait."""
         served = False
         while self._waiting and not (served and self._shaper.nothing_due()):
             self._record_take(self._handles.rmw_subscription, self._waiting[0].about)

@@ -114,7 +114,7 @@ class NodeProcess:
     def _work(
         self, index: int, callback: CallbackDescription, publishers: Sequence[TracedPublisher]
     ) -> executor.Work:
-        """Return what a callback does before it publishes: call a function, or spend drawn times."""
+        """Return what a callback does before it publishes: call a function, or spend time."""
         if callback.computes is not None:
             function = executor.load_function(callback.computes)
             return executor.computing(callback.computes, function, len(publishers))
@@ -231,7 +231,7 @@ class NodeProcess:
         """Have a gate switch to the modes that are announced on a topic."""
 
         def switch(message: dds.Message) -> None:
-            shaper.queue.switch(text_of(message.payload), time.monotonic_ns())
+            shaper.switch(text_of(message.payload), time.monotonic_ns())
 
         handle = self.log.new_handle()
         self._subscribe(handle, topic, traced_callback(self.log, handle, switch))
@@ -258,9 +258,8 @@ class NodeProcess:
         for times in self.execution_times:
             times.refill(min(1 + (stop_ns - start_ns) // min(periods), 100_000))
         for shaper, gate in self.shapers:
-            shaper.queue.set_phase(start_ns + shaper.gate.phase_ns, 0)
-            for from_ns, by_ns in gate.moved(start_ns):
-                shaper.queue.move_slots(by_ns, from_ns)
+            shaper.queue.phase_ns = start_ns + shaper.gate.phase_ns
+            shaper.queue.moves.extend(gate.moved(start_ns))
         scheduling.stop_garbage_collection()
         self.executor.spin_until(stop_ns, last_timer_ns)
 

@@ -28,7 +28,7 @@ class Timing:
 
 
 def timing_of(application: Application, cycles: int, start_ns: int) -> Timing:
-    """Compute the instants of a run of ``cycles`` recorded cycles, with timers from ``start_ns`` on.
+    """Compute the instants of a run of ``cycles`` recorded cycles; timers start at ``start_ns``.
 
     Recording begins just before an expiry of the chain's timer, so that no callback instance is cut
     in two. The run goes on after the last cycle until what began in it is complete.
