@@ -12,6 +12,7 @@ import socket
 import sys
 import time
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import rclpy
@@ -219,9 +220,12 @@ class Shaping:
         outcome = self._shaper.hold()
         if outcome is None:
             return
-        if turn is not None and turn.was_bypassed(key):
-            self._readiness.ask_for()
-            return
+        if turn is not None:
+            if turn.was_bypassed(key):
+                self._readiness.ask_for()
+                return
+            if any(turn.is_overtaken_by(newer.about) for newer in self._shaper.queue.waiting):
+                outcome = replace(outcome, release=outcome.release.dropping("replaced"))
         published = stalled = None
         if outcome.release.at_ns is not None:
             try:
