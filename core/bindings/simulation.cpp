@@ -167,7 +167,7 @@ void bind_gate(nb::module_ & module) {
       property(name, word_of(member, words...));
   });
   property("mode_names", value_in(&Gate::modes));
-  property("bands", value_in(&Gate::bands));
+  property("mode_slots", value_in(&Gate::mode_slots));
   property("first_mode", value_in(&Gate::first_mode));
   property("late", word_of(&Gate::late, policy_names));
   property("depth", value_in(&Gate::depth));

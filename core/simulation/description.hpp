@@ -9,9 +9,10 @@
 #include <cstddef>
 #include <cstdint>
 #include <optional>
+#include <utility>
 #include <vector>
 
-#include "gate/decision.hpp"
+#include "gate/gate.hpp"
 
 namespace chainshaper::simulation {
 
@@ -112,7 +113,8 @@ struct PublisherDescription {
 struct GateDescription {
   Gate gate;
   std::vector<std::int64_t> modes;  // the number of each of the gate's modes in the application
-  std::vector<Move> moves;
+  // From when on slots are moved from where the gate has them, and by how much.
+  std::vector<std::pair<Nanoseconds, Nanoseconds>> moves;
   Nanoseconds spin_ns{0};   // it watches the clock for so long before a release
   Nanoseconds pause_ns{0};  // and rests for so long behind a publication
 };

@@ -17,9 +17,8 @@ bool Engine::enter_gate(Thread & thread) {
   // A gate at rest knows of a message when it has taken it.
   const bool rested = thread.carried.arrival >= gate.turns.free_ns;
   gate.arrival = rested ? now_ : thread.carried.arrival;
-  gate.release = gate.turns.decide({gate.arrival, thread.carried.origin, gate.phase});
-  if (gate.release.anchor == Anchor::stamp)
-    gate.phase = modulo(gate.release.origin_ns, gate.turns.gate.cycle_ns);
+  const Nanoseconds phase = gate.turns.see_phase(gate.arrival, thread.carried.origin);
+  gate.release = gate.turns.decide({gate.arrival, thread.carried.origin, phase});
   thread.began = now_;
   if (!gate.release.at_ns) return leave_gate(thread);
   thread.step = Step::gate_wake;
@@ -76,8 +75,9 @@ void Engine::look_at_waiting(const Entity & entity) {
   }
   if (entity.history.size() == 0) return;
   for (const Message * newer = &entity.history.oldest(); newer != nullptr; newer = newer->next) {
-    const Arrival arrival{newer->carried.arrival, newer->carried.origin, gate.phase};
-    if (gate.turns.is_replaced(gate.release, arrival, now_)) {
+    const Nanoseconds arrival = newer->carried.arrival;
+    const Nanoseconds phase = gate.turns.schedules.in_force(arrival).phase_ns;
+    if (gate.turns.is_replaced(gate.release, {arrival, newer->carried.origin, phase}, now_)) {
       gate.release.drop(Dropped::replaced);
       return;
     }
@@ -95,8 +95,8 @@ bool Engine::leave_gate(Thread & thread) {
 // Logs the oldest message of a full history as overflowed.
 void Engine::overflow(Entity & entity) {
   const Carried & oldest = entity.history.oldest().carried;
-  const Arrival arrival{oldest.arrival, oldest.origin, entity.gate->phase};
-  Release release = entity.gate->turns.release_at(arrival, now_);
+  const Nanoseconds phase = entity.gate->turns.schedules.in_force(oldest.arrival).phase_ns;
+  Release release = entity.gate->turns.release_at({oldest.arrival, oldest.origin, phase}, now_);
   release.drop(Dropped::overflowed);
   log_release(entity, now_, *entity.executor->threads.front(), oldest.source, oldest.arrival,
               release);

@@ -98,16 +98,14 @@ struct GateAtWork {
       : turns(described.gate),
         modes(described.modes),
         spin(described.spin_ns),
-        pause(described.pause_ns),
-        phase(described.gate.phase_ns) {
-    turns.moves.assign(described.moves.begin(), described.moves.end());
+        pause(described.pause_ns) {
+    for (const auto & [from_ns, by_ns] : described.moves) turns.move_slots(by_ns, from_ns);
   }
 
   Turns turns;
   std::vector<std::int64_t> modes;  // the number of each in the application
   Nanoseconds spin;
   Nanoseconds pause;
-  Nanoseconds phase;       // where cycles begin for messages without a good stamp
   Nanoseconds arrival{0};  // of the message that it holds
   Release release{};       // what was decided about it
 };

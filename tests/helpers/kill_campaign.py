@@ -7,12 +7,17 @@ Each case starts a verb, beside a node that a plan may govern, and kills or stop
 processes at a random instant while it runs. Afterwards no thread may be frozen or real-time, no
 process, group or journal of the run may be left, nothing in /run, /dev/shm and /tmp, and no output
 that cannot be read; what is hidden beside an output, `release` must remove or name. It prints a
-line of JSON for each case, and one with the sums; a case is repeated by its own seed (`--seed SEED
---kills 1`). A case whose verb had ended before the kill is counted as `too late`, and not as a
-kill.
+line of JSON for each case, and one with the sums of each lane; a case is repeated by its own seed
+(`--seed SEED --kills 1`).
+
+The instant is a random share of the time for which the verb went on the last time, behind its
+start, its first writing, or the moment from which its plan was in force. A case whose verb has
+ended before it is counted as `too late`, and not as a kill. All lanes know how long verbs go on.
+With `--rehearse` each verb goes on to its end before, so that one that is refused at once is seen.
 
 Python's own traceback is a finding, but for Ctrl-C before the first line of ours could run: until
 then the interpreter has its own handler, which no program can replace (`before our first line`).
+Applications that verbs start are Python too: what they say is kept apart.
 
 All of it is in namespaces of its own for processes, mounts, networks and groups, one set a lane:
 needs root, and harms no others. It has threads of the machine under SCHED_FIFO, so nothing that
@@ -21,6 +26,7 @@ measures should run beside it; it pauses between two cases while the FILE exists
 
 import argparse
 import contextlib
+import itertools
 import json
 import os
 import random
@@ -45,11 +51,16 @@ TIDY_S = 40.0
 """Until all is as before: a guardian has a tenth of a second, a busy machine much more."""
 INSIDE = "CHAINSHAPER_KILL_CAMPAIGN"
 EMPTY = (Path("/dev/shm"), Path("/tmp"))
-LONGEST_S = 12.0
-"""A kill comes this long after the start at most, or when the verb has ended, as seen before."""
+LONGEST_S = {"start": 12.0, "writing": 12.0, "in force": 0.5}
+"""A kill comes this long at most behind each of these."""
+FIRST_S = {"start": 1.0, "writing": 0.1, "in force": 0.5}
+"""The same while nobody knows yet how long the verb goes on."""
+LONGER = 1.05
+"""So much longer a verb is taken to go on for each kill that hits: too few are too late else."""
+PATIENCE_S = (2.0, 2.0, 40.0)
+"""What was asked to end may take so long, then it is killed."""
 _EMITS = """
-import ctypes, signal, time
-signal.signal(signal.SIGINT, signal.SIG_DFL)  # its traceback would pass for one of ours
+import ctypes, time
 libc = ctypes.CDLL(None)
 libc.prctl(15, b"n\\xc3\\xa4\\xc3", 0, 0, 0)
 libc.ros_trace_rcl_node_init(ctypes.c_uint64(1), None, b"n\\xfc", b"/")
@@ -100,12 +111,18 @@ def generate_launch_description():
 
 @dataclass
 class Case:
-    """One kill: what is started, whether on a full disk, and what is left behind it."""
+    """One kill: what is started, whether on a full disk, and what is left behind it.
+
+    It comes ``after_s`` behind what it is ``behind``. ``ended`` is how a verb ended before it.
+    """
 
     seed: int
     verb: str
     full: str = ""
+    behind: str = "start"
+    after_s: float = 0.0
     kill: str = ""
+    ended: str = ""
     faults: list[str] = field(default_factory=list)
     left: list[str] = field(default_factory=list)
 
@@ -126,13 +143,20 @@ def verbs(folder: Path) -> dict[str, tuple[list[str], Path | None]]:
         place = output.with_name(output.name + ending)
         return [*map(str, words), "-o", str(place)], place
 
-    emitting = ("--", sys.executable, "-c", _EMITS)
-    words, place = writing("", "record", "--source", "preload")
+    said_apart = f'exec "$0" -S -c "$@" 2> {WORK}/application'
+    node = ("--ros-args", "-r", "__node:=first")
+    emitting = ("--", "sh", "-c", said_apart, sys.executable, _EMITS, *node)
+    recorded, at = writing("", "record", "--source", "preload")
+    profiling = ("profile", "--node", "first", "--source", "preload", "--core", core())
+    profiled, _ = writing("", *profiling)
     live, live_plan, budget = (folder / name for name in ("live.yaml", "lplan.yaml", "budget.yaml"))
     package, figures = WORK / "small" / "pkg", WORK / "small" / "figures"
     watch = ("watch", "--every", "100ms", "--json", "--recorder", str(WORK / "small"))
+    chain = ("--chain", "/a../b")
     shape = ("shape", live, live_plan, "--cycles", 60)
-    adapt = ("--backend", "fifo", "--adapt")
+    kept_plan, adapted = folder / "kplan.yaml", WORK / "small" / "adapted"
+    adapting = ("apply", kept_plan, "--backend", "freezer", "--adapt", "--", *CLI, "shape")
+    adapting = (*adapting, folder / "slow.yaml", kept_plan, "--cycles", 300, "-o", adapted)
     return {
         "version": (["--version"], None),
         "info": (["info", str(recording)], None),
@@ -143,10 +167,10 @@ def verbs(folder: Path) -> dict[str, tuple[list[str], Path | None]]:
         "run": writing("", "run", live, "--cycles", 60),
         "shape": writing("", *shape),
         "shape-adapt": writing("", *shape, "--adapt"),
-        "apply-adapt": (["apply", servers, *adapt, "--phase", "0ms"], None),
-        "watch": ([*watch, *emitting], None),
+        "apply-adapt": ([*map(str, adapting)], adapted),
+        "watch": ([*watch, *chain, *emitting], None),
         "watch-plan": ([*watch, "--plan", str(plan), *emitting], None),
-        "watch-metrics": ([*watch, "--metrics", "9464", *emitting], None),
+        "watch-metrics": ([*watch, *chain, "--metrics", "9464", *emitting], None),
         "watch-budget": ([*watch, "--budget", str(budget), *emitting], None),
         "generate": (["generate", str(application), "-o", str(package)], package),
         "describe": writing(".yaml", "describe", recording),
@@ -165,13 +189,11 @@ def verbs(folder: Path) -> dict[str, tuple[list[str], Path | None]]:
             ["demo", "--application", str(live), "--cycles", "60", "-o", str(WORK / "small" / "d")],
             None,
         ),
-        "profile": writing(
-            "", "profile", "--node", "first", "--source", "preload", "--core", core(), *emitting
-        ),
+        "profile": ([*profiled, *emitting], at),
         "handover": ([str(WORK / "pages"), str(HERE.parent / "robot" / "output_process.py")], None),
         "apply": (["apply", servers, "--backend", "freezer", "--phase", "0ms"], None),
         "apply-fifo": (["apply", servers, "--backend", "fifo", "--phase", "0ms"], None),
-        "record": ([*words, *emitting], place),
+        "record": ([*recorded, *emitting], at),
         "simulate": writing("", "simulate", application, "--cycles", 300),
         "sweep": writing(
             ".parquet", "sweep", application, "--cycles", 2000, "--vary", "bands=1,2,3"
@@ -202,10 +224,13 @@ def write_inputs(folder: Path) -> None:
 
     save_plan(Plan.of(plan_for(server("first", "victim", (0, 30)))), folder / "servers.yaml")
     (folder / "live.yaml").write_text(LIVE.replace("CORE", str(core())))
+    slower = (folder / "live.yaml").read_text().replace("constant: 200us", "constant: 900us")
+    (folder / "slow.yaml").write_text(slower)  # slots that follow its latencies are moved
     (folder / "app.launch.py").write_text(_LAUNCH)
     for words in (
         ("simulate", "live.yaml", "--cycles", "200", "-o", "lrec"),
         ("plan", "lrec", "-o", "lplan.yaml"),
+        ("plan", "lrec", "--shaping-thread", "in-slots", "-o", "kplan.yaml"),
         ("init", "-o", "app.yaml"),
         ("simulate", "app.yaml", "--cycles", "200", "-o", "rec"),
         ("plan", "rec", "-o", "plan.yaml"),
@@ -235,8 +260,7 @@ def mount(folder: Path, size: str) -> None:
 
 def writes() -> bool:
     """Whether the verb has begun to write: an output, a temporary file."""
-    places = (one for folder in (WORK / "small", *EMPTY) for one in folder.iterdir())
-    return any(one.name != "filling" for one in places)
+    return any({*os.listdir(folder)} - {"filling"} for folder in (WORK / "small", *EMPTY))  # noqa: PTH208
 
 
 def output_of() -> bytes:
@@ -268,7 +292,7 @@ class Victim:
         self.group = mount_point() / os.fsdecode(b"victim\xfc-%d" % random.getrandbits(32))
         self.group.mkdir()
         output = WORK / "victim"
-        self.process = subprocess.Popen(node_command("victim", output, 10_000_000, 1_000_000))
+        self.process = subprocess.Popen(node_command("victim", output, 50_000_000, 1_000_000))
         (self.group / "cgroup.procs").write_text(str(self.process.pid))
         wait(lambda: output.exists() and output.stat().st_size > 0, 30)
         self.before = scheduling(self.process.pid)
@@ -299,17 +323,56 @@ def _removed(group: Path) -> bool:
     return group.exists()
 
 
-def wait(condition: Callable[[], bool], seconds: float) -> bool:
+def wait(condition: Callable[[], bool], seconds: float, pause_s: float = 0.02) -> bool:
     """Whether it comes true before the time is over."""
     deadline = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > deadline:
             return False
-        time.sleep(0.02)
+        time.sleep(pause_s)
     return True
 
 
-def run_case(case: Case, folder: Path, victim: Victim, longest: dict[str, float]) -> None:
+def known_span(folder: Path, case: Case) -> float:
+    """For how long the verb goes on (s) behind what the kill is to be behind, as far as known."""
+    for place in (_span_file(folder, case, case.full), _span_file(folder, case, "")):
+        with contextlib.suppress(OSError, ValueError):  # a lane writes it
+            return float(place.read_text())
+    return FIRST_S[case.behind]
+
+
+def note_span(folder: Path, case: Case, seconds: float) -> None:
+    """Have all lanes know for how long the verb goes on."""
+    longest_s = LONGEST_S[case.behind]
+    _span_file(folder, case, case.full).write_text(str(min(longest_s, max(0.005, seconds))))
+
+
+def _span_file(folder: Path, case: Case, full: str) -> Path:
+    return folder / "-".join(("span", case.verb, case.behind, full.replace("/", "")))
+
+
+def await_instant(
+    case: Case, process: subprocess.Popen[bytes], folder: Path, chance: random.Random
+) -> None:
+    """Wait until the verb is to be killed, or has ended before; note for how long it goes on."""
+
+    def ended() -> bool:
+        return process.poll() is not None
+
+    if case.behind == "in force":
+        wait(lambda: b"in force" in output_of() or ended(), 60)
+    elif case.behind == "writing":
+        wait(lambda: writes() or ended(), 60, 0.002)
+    if ended():
+        case.ended = f"before {case.behind}: "
+        return
+    began, span_s = time.monotonic(), known_span(folder, case)
+    case.after_s = round(chance.uniform(0, span_s), 4)
+    wait(ended, case.after_s, 0.002)
+    note_span(folder, case, time.monotonic() - began if ended() else span_s * LONGER)
+
+
+def run_case(case: Case, folder: Path, victim: Victim) -> None:
     """Start the verb, kill, and look."""
     from processes import marked_processes
 
@@ -320,7 +383,6 @@ def run_case(case: Case, folder: Path, victim: Victim, longest: dict[str, float]
         case.full = chance.choice(("", "", "", "its disk", "/run"))
         if case.full:
             disks.enter_context(filled(WORK / "small" if case.full == "its disk" else Path("/run")))
-        began = time.monotonic()
         with (WORK / "said").open("wb") as said:
             process = subprocess.Popen(
                 command(case.verb, words),
@@ -329,42 +391,82 @@ def run_case(case: Case, folder: Path, victim: Victim, longest: dict[str, float]
                 stdout=said,
                 stderr=said,
             )
-        in_force = case.verb.startswith("apply") and chance.random() < 0.7
-        if in_force:
-            wait(lambda: b"in force" in output_of() or process.poll() is not None, 30)
-            time.sleep(chance.uniform(0, 0.5))
-        elif output is not None and chance.random() < 0.5:
-            wait(lambda: writes() or process.poll() is not None, 60)
-            time.sleep(chance.uniform(0, 0.3))
-        else:
-            most = longest.get(case.verb, LONGEST_S)
-            wait(lambda: process.poll() is not None, chance.uniform(0, most))
-        if process.poll() is not None:
-            longest[case.verb] = time.monotonic() - began
+        if case.verb.startswith("apply") and case.full != "/run" and chance.random() < 0.7:
+            case.behind = "in force"
+        elif output is not None and not case.full and chance.random() < 0.5:
+            case.behind = "writing"
+        await_instant(case, process, folder, chance)
         pids = marked_processes(marker)
         case.kill = "a kill" if pids else "too late"
-        chosen = {process.pid} & {*pids} if chance.random() < 0.7 else set[int]()
-        if pids and (not chosen or chance.random() < 0.6):
-            chosen.add(chance.choice(sorted(pids)))
-        if case.verb == "handover" and chance.random() < 0.7:  # both nodes at once
-            chosen = {*pids} - {process.pid}
-        number = chance.choice((signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT))
-        stops = chance.random() < 0.3
-        for pid in chosen:
-            name = "the verb" if pid == process.pid else pids[pid]
-            case.faults.append(f"{'SIGSTOP, then ' if stops else ''}{number.name} to {name}")
-            for one in (signal.SIGSTOP, number) if stops else (number,):
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(pid, one)
-        if not wait(lambda: process.poll() is not None, 2):
-            with contextlib.suppress(ProcessLookupError):  # stopped, or it had another killed
-                os.kill(process.pid, signal.SIGKILL)
-                case.faults.append("SIGKILL to the verb")
+        if process.poll() is not None:
+            last = output_of().decode(errors="replace").strip().rpartition("\n")[2]
+            case.ended += f"exit code {process.returncode}: {last[-200:]}"
+        kill_some(case, process, pids, chance)
         process.wait()
     look_behind(case, victim, marker, output)
     for pid in marked_processes(marker):
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
+
+
+def rehearse(verb: str, folder: Path) -> Case:
+    """Let a verb go on to its end; a plan that is in force is ended by Ctrl-C, nodes are killed."""
+    from processes import marked_processes
+
+    case, marker = Case(0, verb, behind="end"), f"CASE={uuid.uuid4().hex}"
+    words, output = verbs(folder)[verb]
+    environment, began = {**os.environ, **dict([marker.split("=")])}, time.monotonic()
+    with (WORK / "said").open("wb") as said:
+        process = subprocess.Popen(
+            command(verb, words),
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=said,
+            stderr=said,
+        )
+    stays = verb.startswith("apply") and output is None
+
+    def done() -> bool:
+        return process.poll() is not None or (stays and b"in force" in output_of())
+
+    wait(done, 3 if verb == "handover" else 90)
+    if process.poll() is None:
+        case.faults.append("SIGINT, for it went on")
+        process.send_signal(signal.SIGINT)
+    process.wait()
+    case.after_s = round(time.monotonic() - began, 3)
+    last = output_of().decode(errors="replace").strip().rpartition("\n")[2]
+    case.ended = f"exit code {process.returncode}: {last[-300:]}"
+    for pid in marked_processes(marker):
+        os.kill(pid, signal.SIGKILL)
+    remove_outputs()
+    return case
+
+
+def kill_some(
+    case: Case, process: subprocess.Popen[bytes], pids: dict[int, str], chance: random.Random
+) -> None:
+    """Kill or stop the verb, one of its processes or both; then the verb, if it does not end."""
+    chosen = {process.pid} & {*pids} if chance.random() < 0.7 else set[int]()
+    if pids and (not chosen or chance.random() < 0.6):
+        chosen.add(chance.choice(sorted(pids)))
+    if case.verb == "handover" and chance.random() < 0.7:  # both nodes at once
+        chosen = {*pids} - {process.pid}
+    number = chance.choice((signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT))
+    stops = chance.random() < 0.3
+    for pid in chosen:
+        name = "the verb" if pid == process.pid else pids[pid]
+        case.faults.append(f"{'SIGSTOP, then ' if stops else ''}{number.name} to {name}")
+        for one in (signal.SIGSTOP, number) if stops else (number,):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, one)
+    patience_s = chance.choice(PATIENCE_S)
+    if stops or process.pid not in chosen:
+        patience_s = min(PATIENCE_S)
+    if not wait(lambda: process.poll() is not None, patience_s):
+        with contextlib.suppress(ProcessLookupError):  # stopped, or it had another killed
+            os.kill(process.pid, signal.SIGKILL)
+            case.faults.append(f"SIGKILL to the verb after {patience_s:.0f} s")
 
 
 def look_behind(case: Case, victim: Victim, marker: str, output: Path | None) -> None:
@@ -407,7 +509,11 @@ def look_behind(case: Case, victim: Victim, marker: str, output: Path | None) ->
             case.left.append(f"beside the output: {one.name!r}")
     if output is not None:
         case.left += half_written(output)
-    for place in (small, *EMPTY):
+    remove_outputs()
+
+
+def remove_outputs() -> None:
+    for place in (WORK / "small", *EMPTY):
         for one in place.iterdir():
             subprocess.run(["rm", "-rf", str(one)], check=True)
 
@@ -421,8 +527,8 @@ def tracebacks(case: Case, said: bytes) -> Iterator[str]:
     for trace in text.split("Traceback (most recent call last)")[1:]:
         frames = [name for name in _FRAME.findall(trace) if "/chainshaper/" in name]
         early = all(name.endswith(("chainshaper/__init__.py", "__main__.py")) for name in frames)
-        asked = any("SIGINT" in one for one in case.faults) or 'File "<string>"' in trace
-        if "KeyboardInterrupt" in trace and early and asked:  # that string is the application
+        asked = any("SIGINT" in one for one in case.faults)
+        if "KeyboardInterrupt" in trace and early and asked:
             case.faults.append("a traceback before our first line")
         else:
             yield f"a traceback: {trace[-1500:]}"
@@ -481,10 +587,11 @@ def main() -> None:
     arguments = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    arguments.add_argument("--kills", type=int, default=20, help="how many, of each lane")
+    arguments.add_argument("--kills", type=int, default=20, help="so many in time, in all lanes")
     arguments.add_argument("--seed", type=int, default=1)
     arguments.add_argument("--seconds", type=float, default=600.0, help="no case begins later")
     arguments.add_argument("--verbs", nargs="+", help="of these alone; apply alone is real-time")
+    arguments.add_argument("--rehearse", action="store_true", help="each verb once, to its end")
     arguments.add_argument("--lanes", type=int, default=1, help="so many cases side by side")
     arguments.add_argument("--core", type=int, help="run on this core alone")
     arguments.add_argument("--pause-while", type=Path, metavar="FILE")
@@ -500,6 +607,7 @@ def main() -> None:
 
         for lane in range(given.lanes):
             group = mount_point() / f"kills-{os.getpid()}-{lane}"
+            _remove_groups(group)
             wait(lambda group=group: not _removed(group), 5)  # type: ignore[misc]
         sys.exit(any(codes))
     number, _, inputs = os.environ.pop(INSIDE).partition(" ")
@@ -529,15 +637,20 @@ def run_lane(given: argparse.Namespace, lane: int, folder: Path) -> bool:
         mount(place, size)
     sums, until = Counter[str](), time.monotonic() + given.seconds
     mount_disks()
+    (groups / "cases").mkdir()  # beside the victim's: threads of a group that has others in it
+    (groups / "cases" / "cgroup.procs").write_text("0")  # are not frozen one by one
     names = given.verbs or sorted(verbs(folder))
-    longest, victim = dict[str, float](), Victim()
-    for seed in range(given.seed + lane * given.kills, given.seed + (lane + 1) * given.kills):
+    victim, kills = Victim(), -(-given.kills // given.lanes)
+    for verb in names[lane :: given.lanes] if given.rehearse else ():
+        sys.stdout.write(json.dumps(vars(rehearse(verb, folder))) + "\n")
+        sys.stdout.flush()
+    for seed in itertools.count(given.seed + lane, given.lanes):
         while pause is not None and given.pause_while.name in os.listdir(pause):  # noqa: PTH208
             time.sleep(1)
-        if time.monotonic() > until:
+        if sums["a kill"] == kills or time.monotonic() > until:
             break
         case = Case(seed, names[seed % len(names)])
-        run_case(case, folder, victim, longest)
+        run_case(case, folder, victim)
         sums[case.kill] += 1
         sums[f"{case.kill} of {case.verb}"] += 1
         sums["cases with something left"] += bool(case.left)

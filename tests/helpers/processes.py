@@ -33,7 +33,7 @@ def marked_processes(marker: str) -> dict[int, str]:
     for pid in parents():
         try:
             if marker.encode() in Path(f"/proc/{pid}/environ").read_bytes():
-                found[pid] = Path(f"/proc/{pid}/comm").read_text().strip()
+                found[pid] = Path(f"/proc/{pid}/comm").read_bytes().decode(errors="replace").strip()
         except OSError:  # it ended meanwhile, or is another user's
             continue
     return found

@@ -18,7 +18,7 @@ from strangers import NOBODY, needs_root, strange
 
 from chainshaper.planning import ChainPlan
 from chainshaper.planning.chain_plan import revised
-from chainshaper.robot.handover import MOVING, VERSION, Page, open_page
+from chainshaper.robot.handover import MOVING, NEW_MOVE, VERSION, Change, Page, open_page
 from chainshaper.sources.gate_log import read_gate_log, releases_so_far
 from chainshaper.splicing.shaped_outputs import FollowedOutput, ask_phase, find_outputs, output_text
 from chainshaper.splicing.shaping_process import ShapingProcess, write_shaping_process
@@ -326,7 +326,8 @@ def test_a_stranger_s_page_says_nothing_of_our_outputs() -> None:
         try:
             assert page.lock()
             assert page.lock(MOVING)
-            page["holder"], page["moved_ns"], page["moved_from_ns"] = stranger.pid, 50_000_000, 1
+            page["holder"] = stranger.pid
+            page.ask(Change(1, NEW_MOVE, 50_000_000))
             (output,) = (output for output in find_outputs() if output.topic == topic)
             assert (output.user, output.shaping_node) == (NOBODY, stranger.pid)
             text = output_text(output)

@@ -5,12 +5,14 @@ and U collide in some cycle unless the distance of their starts, modulo g = gcd(
 e]: the distances that occur are all numbers congruent to it. So each pair of chains allows a set of
 differences of offsets modulo g, and nothing else matters.
 
-**Few chains are searched exhaustively.** From any solution, take the chains that are not linked to
-the first by a chain of tight pairs (pairs whose difference is at an end of an allowed interval),
-and start all of them earlier until some pair becomes tight. Repeated, that links every chain to the
-first without breaking a constraint: it is enough to try the ends of allowed intervals. Many chains
-are first fitted in one after the other, which is quick and mostly enough; where it is not, the
-CP-SAT solver of OR-tools decides, which is exact as well but may run out of time.
+**Candidates.** From any solution, take the chains that are not linked to the first by a chain of
+tight pairs (pairs whose difference is at an end of an allowed interval), and start all of them
+earlier until some pair becomes tight. Repeated, that links every chain to the first without
+breaking a constraint: it is enough to try the ends of allowed intervals.
+
+Chains are fitted in one after the other, which is quick and mostly enough, but proves nothing.
+Where it finds nothing, the CP-SAT solver of OR-tools decides, which is exact but may run out of
+time; with 30 chains that nearly fill a core it does, where the fitting takes two seconds.
 """
 
 import math
@@ -43,9 +45,8 @@ from chainshaper.planning.chain_plan import (
 from chainshaper.planning.overruns import in_cycle, slots_without
 from chainshaper.planning.shaping import BOUNDARY_NS, OUTPUT_PRIORITY, with_gates_level
 from chainshaper.values.durations import duration_text
-from chainshaper.values.errors import InputError, OperationError, extra_library
+from chainshaper.values.errors import InputError, OperationError, PlatformError, extra_library
 
-MOST_SEARCHED = 4  # chains; beyond, CP-SAT is faster
 TIME_LIMIT_SECONDS = 60.0
 MOST_CYCLES = 2_000  # of all chains in a hyper-period that is played out for the solver
 SHARES = (0.9, 0.75, 0.5, 0.25, 0.1, 0.0)  # of a slot that begins while no better one is open
@@ -56,7 +57,8 @@ LEAD_NS = 2_000_000  # a cycle starts so long after the chain's timer expires (D
 # (:data:`LEAD_NS`); and behind its pause, for its notes.
 BEFORE_NS, BEHIND_NS = 4_000_000, 2_000_000
 WAKE_UP_NS = 150_000  # of a gate that waits for the others
-MOST_FITTINGS = 10_000  # of one chain, before the solver is asked; some seconds for 30 chains
+SURELY_FITTED = 4  # chains: in tests these were fitted wherever they have offsets
+MOST_FITTINGS = 300  # of each chain, before the solver is asked; some seconds for 30 chains
 
 
 _Slots: TypeAlias = Mapping[tuple[int, int], Sequence[Slot]]
@@ -356,13 +358,10 @@ def _find_offsets(
     for group in linked(len(tables), puzzle.free):
         if len(group) == 1:
             continue
-        if len(group) <= MOST_SEARCHED:
-            solution = puzzle.searched(group, {group[0]: 0})
-        else:
-            deadline = time.monotonic() + time_limit_s
-            solution = puzzle.fitted(group, deadline)
-            if solution is None:
-                solution = puzzle.solved(group, max(0.0, deadline - time.monotonic()))
+        deadline = time.monotonic() + time_limit_s
+        solution = puzzle.fitted(group, deadline)
+        if solution is None:
+            solution = puzzle.solved(group, max(0.0, deadline - time.monotonic()))
         if solution is None:
             names = ", ".join(tables[k].name for k in group)
             reason = f"no offsets at which {names} keep their slots apart, although any two"
@@ -407,19 +406,6 @@ class _Puzzle:
                 if not self.free[j, k][1]:
                     raise OperationError(_pair_too_long(one, two, common))
 
-    def searched(self, group: list[int], placed: dict[int, int]) -> dict[int, int] | None:
-        """Offsets of a group, of which some are placed; None: there are none."""
-        if len(placed) == len(group):
-            return placed
-        for k in (k for k in group if k not in placed):
-            candidates = self._candidates(k, placed)
-            apart = [self._apart(j, k, candidates - base) for j, base in placed.items()]
-            for offset in candidates[np.all(apart, axis=0)].tolist():
-                found = self.searched(group, {**placed, k: offset})
-                if found is not None:
-                    return found
-        return None
-
     def _candidates(self, k: int, placed: dict[int, int]) -> NDArray[np.int64]:
         """Offsets of k, ascending, at which it is tight with one of what is placed; or 0."""
         found = [np.zeros(1, dtype=np.int64)]
@@ -453,7 +439,7 @@ class _Puzzle:
         weight = dict.fromkeys(group, 1)
         placed = {group[0]: 0}
         generator = random.Random(0)  # noqa: S311 - no secrets; the same plans, the same offsets
-        for _ in range(MOST_FITTINGS):
+        for _ in range(MOST_FITTINGS * len(group)):
             if not waiting:
                 first = placed[group[0]]
                 return {k: (offset - first) % tables[k].cycle_ns for k, offset in placed.items()}
@@ -478,7 +464,15 @@ class _Puzzle:
 
     def solved(self, group: list[int], time_limit_s: float) -> dict[int, int] | None:
         """The same by CP-SAT; None: there are none."""
-        cp_model = extra_library("ortools.sat.python.cp_model", "offsets for this many chains")
+        try:
+            cp_model = extra_library("ortools.sat.python.cp_model", "offsets for this many chains")
+        except PlatformError:
+            if len(group) > SURELY_FITTED:
+                raise
+            names = ", ".join(self.tables[k].name for k in group)
+            reason = f"no offsets were found at which {names} keep their slots apart"
+            remedy = "whether there are any, `pip install 'chainshaper[solvers]'` lets find out"
+            raise OperationError(f"{reason}: {_fullest(self.tables, group)}; {remedy}") from None
         model, cycles = cp_model.CpModel(), {k: self.tables[k].cycle_ns for k in group}
         offsets = {k: model.new_int_var(0, cycles[k] - 1, f"offset{k}") for k in group}
         model.add(offsets[group[0]] == 0)

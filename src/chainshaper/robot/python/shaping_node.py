@@ -106,7 +106,7 @@ def listen_to_modes(node: Node, shaper: Shaper, topic: str) -> None:
             qos.durability = QoSDurabilityPolicy.TRANSIENT_LOCAL
 
     def announced(message: Any) -> None:
-        if shaper.switch(message.data, time.monotonic_ns()):
+        if shaper.queue.switch(message.data, time.monotonic_ns()):
             logger.info(f"mode {message.data}")
         else:
             logger.warning(f"there is no mode {message.data!r}")
@@ -168,7 +168,7 @@ class Shaping:
         """``phase_ns`` may be set while the node runs, in force from the next cycle on."""
         for one in parameters:
             if one.name == "phase_ns":
-                self._shaper.set_phase(one.value, time.monotonic_ns())
+                self._shaper.queue.set_phase(one.value, time.monotonic_ns())
         return SetParametersResult(successful=True)
 
     def _await_receivers(self, node: Node, publisher: Any) -> None:

@@ -345,7 +345,7 @@ private:
     const auto stamp = stamp_of(*message, 0);
     const bool within = info.from_intra_process;  // without anything else of DDS
     if (const std::unique_lock<std::mutex> ours(asking_, std::try_to_lock); ours && asked_phase_) {
-      shaper_.set_phase(asked_phase_->first, asked_phase_->second);
+      shaper_.queue.set_phase(asked_phase_->first, asked_phase_->second);
       asked_phase_.reset();
     }
     const auto before = shaper_.overflowed.size();
