@@ -44,7 +44,7 @@ void Engine::hand_over(Thread & sender, Publisher & publisher, Message & message
     sender.to_send.push_back(&publisher);
     ++marks_;
     count_in_use();
-  } else {  // the newer ones move up by one place
+  } else {  // the oldest is lost; `to_send` has an entry for it, which the newer ones use
     log(TracePoint::send, now_, &sender,
         {publisher.given->rmw_handle, publisher.history.oldest().carried.source,
          static_cast<std::int64_t>(SendOutcome::overwritten), 0});
