@@ -80,6 +80,6 @@ private:
 };
 
 // Outcomes of an asynchronous publication, in the order of `WORDS["outcome"]` in event_log.py.
-enum class Outcome : std::int64_t { sent, expired, overwritten };
+enum class SendOutcome : std::int64_t { sent, expired, overwritten };
 
 }  // namespace chainshaper::simulation

@@ -99,14 +99,14 @@ struct Executor {
 // A gate in a callback: its messages wait in the history of its reader.
 struct GateAtWork {
   explicit GateAtWork(const GateDescription & described)
-      : turns(described.gate),
+      : decisions(described.gate),
         modes(described.modes),
         spin(described.spin_ns),
         pause(described.pause_ns) {
-    for (const auto & [from_ns, by_ns] : described.moves) turns.move_slots(by_ns, from_ns);
+    for (const auto & [from_ns, by_ns] : described.moves) decisions.move_slots(by_ns, from_ns);
   }
 
-  Turns turns;
+  Decisions decisions;
   std::vector<std::int64_t> modes;  // the application's number of each of the gate's modes
   Nanoseconds spin;
   Nanoseconds pause;

@@ -133,7 +133,7 @@ def test_diagnostics_are_published_where_ros_2_reads_them(launch: list[str]) -> 
     ) as watching:
         time.sleep(8)  # for the nodes, and for what publishes beside them
         topic = ["/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"]
-        echo = ["ros2", "topic", "echo", "--once", "--full-length", *topic]
+        echo = ["ros2", "topic", "echo", "--no-daemon", "--once", "--full-length", *topic]
         heard = subprocess.run(
             ["env", *echo], capture_output=True, text=True, check=False, timeout=60
         )

@@ -420,6 +420,14 @@ class Turn:
         self.page["taken"] += 1  # which tells the standby that this node does not hang
         return True
 
+    def is_overtaken_by(self, key: int | None) -> bool:
+        """Return whether the standby has dealt with this message, which is behind the one in hand.
+
+        The one in hand would come after it. The standby, which started later than this node, did
+        not receive the one in hand. To be called after :meth:`was_bypassed`.
+        """
+        return key in self._bypassed
+
     def done(self, key: int | None) -> None:
         """Note that a message has been published or discarded."""
         self.page.add("released", key or 0)

@@ -231,7 +231,7 @@ class NodeProcess:
         """Have a gate switch to the modes that are announced on a topic."""
 
         def switch(message: dds.Message) -> None:
-            shaper.switch(text_of(message.payload), time.monotonic_ns())
+            shaper.queue.switch(text_of(message.payload), time.monotonic_ns())
 
         handle = self.log.new_handle()
         self._subscribe(handle, topic, traced_callback(self.log, handle, switch))
@@ -258,8 +258,9 @@ class NodeProcess:
         for times in self.execution_times:
             times.refill(min(1 + (stop_ns - start_ns) // min(periods), 100_000))
         for shaper, gate in self.shapers:
-            shaper.queue.phase_ns = start_ns + shaper.gate.phase_ns
-            shaper.queue.moves.extend(gate.moved(start_ns))
+            shaper.queue.set_phase(start_ns + shaper.gate.phase_ns, 0)
+            for from_ns, by_ns in gate.moved(start_ns):
+                shaper.queue.move_slots(by_ns, from_ns)
         scheduling.stop_garbage_collection()
         self.executor.spin_until(stop_ns, last_timer_ns)
 

@@ -186,7 +186,8 @@ public:
         look_again();
         now = monotonic_ns();
       }
-      if (!slept && queue.gate.messages == Messages::newest) look_again();
+      // The first time, it may have come long ago, and newer ones since.
+      if (!slept && (queue.gate.messages == Messages::newest || looked_ns_ == 0)) look_again();
       if (queue.waiting.front().number != number) return std::nullopt;
       if (queue.replaced(release, now)) release.drop(Dropped::replaced);
     }
