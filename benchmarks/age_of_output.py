@@ -19,7 +19,8 @@ from rich.console import Console
 from rich.table import Table
 
 from chainshaper.flow.plan import profile_chains
-from chainshaper.planning.margins import EPSILON_NS, OVERRUN_PROBABILITY, covered_latency
+from chainshaper.planning.late_shares import covered_latency
+from chainshaper.planning.margins import EPSILON_NS, OVERRUN_PROBABILITY
 from chainshaper.robot.decision import release_of
 from chainshaper.robot.gate import OVERRUNS, Gate
 from chainshaper.values.durations import milliseconds

@@ -28,8 +28,10 @@ from rich.table import Table
 
 import chainshaper as cs
 from chainshaper.planning import Plan, PlanRequest, publish_slots
+from chainshaper.planning.adaptation import Tail
 from chainshaper.planning.chain_plan import Adaptation, revised
-from chainshaper.planning.margins import HOP_NS, Tail, covered_latency
+from chainshaper.planning.late_shares import covered_latency
+from chainshaper.planning.margins import HOP_NS
 from chainshaper.workload.description import Application
 
 MS, PROMISED, PER_MINUTE, AFTER_STEP, DELAY = 1_000_000, 0.01, 600, 50, 2
@@ -85,7 +87,7 @@ def followed(latencies: Floats, planned: int) -> tuple[Floats, list[int]]:
     tail = Tail(Adaptation(), PROMISED, planned, float(np.median(latencies[:2_000])), 10**9)
     starts, moves = np.full(latencies.size, float(planned)), []
     for number, latency in enumerate(latencies.tolist()):
-        if (start := tail.saw(latency)) is not None:
+        if (start := tail.add(latency)) is not None:
             moves.append(start)
             starts[number + 1 + DELAY :] = start
     return starts, moves

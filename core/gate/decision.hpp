@@ -1,7 +1,7 @@
 // The gate's decision for one message: when it may leave, or why it never does. The shaping nodes
 // in C++, the gate in a publisher's process and the simulator run this file;
-// chainshaper/robot/gate.py and decision.py are the same in Python, and explain it. It reads no
-// clock and calls no operating system.
+// chainshaper/robot/decision.py is the same in Python, and explains it. It reads no clock and calls
+// no operating system.
 //
 // All times are nanoseconds of one clock. C++17, since that is what ROS 2 builds nodes with.
 
@@ -10,106 +10,13 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
-#include <cstdlib>
-#include <deque>
-#include <limits>
 #include <optional>
-#include <stdexcept>
-#include <string>
-#include <utility>
-#include <vector>
 
+#include "gate/gate.hpp"
+#include "gate/schedules.hpp"
 #include "gate/words.hpp"
 
 namespace chainshaper {
-
-using Maybe = std::optional<std::int64_t>;
-
-// A half-open interval, counted from the anchor.
-struct Slot {
-  std::int64_t start;
-  std::int64_t end;
-};
-
-// Returns the place of a word in a list; none: it is not there.
-template <typename Words, typename Word>
-std::optional<std::size_t> place_of(const Words & words, const Word & word) {
-  const auto found = std::find(words.begin(), words.end(), word);
-  if (found == words.end()) return std::nullopt;
-  return static_cast<std::size_t>(found - words.begin());
-}
-
-// The publish slots of one output. Its numbers and words are declared in chainshaper/robot/gate.py.
-struct Gate : GateValues {
-  std::vector<Slot> slots;
-  std::vector<std::string> modes;  // their names; modes are numbered in this order
-  std::vector<std::size_t> bands;  // the place of each mode's slot
-  std::size_t first_mode{0};       // in force until a mode is announced
-  Policy late{Policy::wait};       // for messages behind their mode's slot
-  std::size_t depth{schema::depth};
-
-  bool may_move(std::int64_t by_ns) const {
-    if (by_ns < -cycle_ns || by_ns > cycle_ns) return false;  // also what a sum could not hold
-    return slots.front().start + by_ns >= 0 && slots.back().end + by_ns <= cycle_ns;
-  }
-
-  Policy policy() const { return modes.empty() || late == Policy::next_slot ? overrun : late; }
-
-  bool lets_out(const Slot & slot, std::int64_t cycle_start_ns, std::int64_t arrival_ns,
-                std::int64_t ready_ns) const {
-    const bool in_time =
-        into_open_slot == Entry::at_once || arrival_ns <= cycle_start_ns + slot.start;
-    return in_time && ready_ns < cycle_start_ns + slot.end;
-  }
-
-  bool counts_from(Maybe stamp_ns, std::int64_t arrival_ns) const {
-    if (!stamp_ns || anchor != Anchor::stamp) return false;
-    const auto age_ns = arrival_ns - *stamp_ns;
-    const auto oldest_ns = (schema::max_age_cycles + due_cycles) * cycle_ns;
-    return -schema::max_future_ns <= age_ns && age_ns <= oldest_ns;
-  }
-};
-
-// Throws std::invalid_argument for a gate that makes no sense.
-inline void check(const Gate & gate) {
-  const auto & slots = gate.slots;
-  bool sound = gate.cycle_ns > 0 && !slots.empty() && gate.due_cycles >= 0 && gate.depth > 0 &&
-               gate.bands.size() == gate.modes.size();
-  // Sums of a time and some cycles must not overflow.
-  constexpr auto longest_ns = std::numeric_limits<std::int64_t>::max() / 4;
-  sound = sound && gate.due_cycles <= longest_ns / gate.cycle_ns - schema::max_age_cycles - 1;
-  sound = sound && (gate.modes.empty() || gate.first_mode < gate.modes.size());
-  std::int64_t previous_end = 0;
-  for (const auto & [start, end] : slots) {
-    sound = sound && previous_end <= start && start < end && end <= gate.cycle_ns;
-    previous_end = end;
-  }
-  for (const auto band : gate.bands) sound = sound && band < slots.size();
-  if (!sound) {
-    throw std::invalid_argument(
-        "a gate needs a cycle, slots in it that ascend and do not overlap, one of them for each "
-        "mode, no negative delay, and room for a message");
-  }
-}
-
-// The time from which on a mode is in force, and the mode's number.
-using Change = std::pair<std::int64_t, std::size_t>;
-
-// The time from which on slots are moved, and by how much from where the gate has them.
-using Move = std::pair<std::int64_t, std::int64_t>;
-
-// Adds a change or a move behind those before it; only the last ones are remembered.
-template <typename Known>
-void remember(std::deque<Known> & known, Known newest) {
-  known.push_back(newest);
-  if (known.size() > static_cast<std::size_t>(schema::changes)) known.pop_front();
-}
-
-inline std::int64_t moved_at(const std::deque<Move> & moves, std::int64_t cycle_start_ns) {
-  const auto before = [&](const Move & move) { return move.first <= cycle_start_ns; };
-  const auto found = std::find_if(moves.rbegin(), moves.rend(), before);
-  return found == moves.rend() ? 0 : found->second;
-}
 
 // The decision for one message. No `at_ns`: it never leaves, it is `dropped`. No `slot`: it leaves
 // in no slot. No `overrun`: it came in time.
@@ -135,16 +42,11 @@ struct Release {
   }
 };
 
-inline std::int64_t modulo(std::int64_t value, std::int64_t cycle_ns) {
-  const std::int64_t rest = value % cycle_ns;
-  return rest < 0 ? rest + cycle_ns : rest;
-}
-
-// Decides when a message may leave, at `ready_ns` at the earliest. `phase_ns` is where cycles start
-// for a message whose stamp is of no use.
+// Decides when a message may leave, at `ready_ns` at the earliest. `phase_ns` is where cycles
+// started when a message came whose stamp is of no use.
 inline Release release_of(const Gate & gate, std::int64_t arrival_ns, Maybe stamp_ns,
-                          const std::deque<Change> & changes, std::int64_t ready_ns,
-                          std::int64_t phase_ns, const std::deque<Move> & moves = {}) {
+                          const Schedules & schedules, std::int64_t ready_ns,
+                          std::int64_t phase_ns) {
   const std::int64_t cycle_ns = gate.cycle_ns;
   std::int64_t origin = arrival_ns - modulo(arrival_ns - phase_ns, cycle_ns);
   std::int64_t due = std::min<std::int64_t>(gate.due_cycles, 1);
@@ -158,17 +60,15 @@ inline Release release_of(const Gate & gate, std::int64_t arrival_ns, Maybe stam
   std::size_t first = 0;
   std::size_t last = gate.slots.size();
   if (!gate.modes.empty()) {
-    const auto before = [origin](const Change & change) { return change.first <= origin; };
-    const auto announced = std::find_if(changes.rbegin(), changes.rend(), before);
-    mode = announced == changes.rend() ? gate.first_mode : announced->second;
-    first = gate.bands[*mode];
+    mode = schedules.in_force(origin).mode.value_or(gate.first_mode);
+    first = gate.mode_slots[*mode];
     if (gate.late != Policy::next_slot) last = first + 1;
   }
   const std::int64_t ready = std::max(arrival_ns, ready_ns);
   // A stamp slightly from the future puts the arrival before its own cycle: cycle 0 still.
   std::int64_t cycle = std::max(due, (ready - origin) / cycle_ns);
   const std::int64_t due_from = origin + due * cycle_ns;
-  std::int64_t moved = moved_at(moves, due_from);
+  std::int64_t moved = schedules.in_force(due_from).moved_ns;
   const Policy policy = gate.policy();
   if (policy != Policy::wait &&
       !gate.lets_out(gate.slots[last - 1], due_from + moved, arrival_ns, ready)) {
@@ -177,7 +77,7 @@ inline Release release_of(const Gate & gate, std::int64_t arrival_ns, Maybe stam
     return late;
   }
   for (;; ++cycle) {
-    moved = moved_at(moves, origin + cycle * cycle_ns);
+    moved = schedules.in_force(origin + cycle * cycle_ns).moved_ns;
     const std::int64_t cycle_start = origin + cycle * cycle_ns + moved;
     for (std::size_t slot = first; slot < last; ++slot) {
       if (!gate.lets_out(gate.slots[slot], cycle_start, arrival_ns, ready)) continue;

@@ -11,6 +11,7 @@
 #include <utility>
 
 #include "gate/decision.hpp"
+#include "gate/schedules.hpp"
 
 namespace chainshaper {
 
@@ -23,14 +24,14 @@ struct Arrival {
 
 // A gate's decisions for one message after the other, and what it remembers between two of them.
 // `Queue` has the messages as well; in a simulation they stay in the history of their reader.
-class Turns {
+class Decisions {
 public:
-  explicit Turns(Gate served) : gate(std::move(served)) { check(gate); }
+  explicit Decisions(Gate served) : gate(std::move(served)), schedules(gate) { check(gate); }
 
   // Decides when a message would leave, without regard to those before it.
   Release release_at(const Arrival & message, std::int64_t ready_ns) const {
-    return release_of(gate, message.arrival_ns, message.stamp_ns, changes, ready_ns,
-                      message.phase_ns, moves);
+    return release_of(gate, message.arrival_ns, message.stamp_ns, schedules, ready_ns,
+                      message.phase_ns);
   }
 
   // Decides when the oldest message may leave, or why it never does.
@@ -39,7 +40,8 @@ public:
     Release release = release_at(oldest, ready_ns);
     if (!release.slot || gate.messages == Messages::all_in_order) return release;
     if (same_cycle(release, left_)) {
-      const std::int64_t last_end = *left_ + moved_at(moves, *left_) + gate.slots.back().end;
+      const std::int64_t moved_ns = schedules.in_force(*left_).moved_ns;
+      const std::int64_t last_end = *left_ + moved_ns + gate.slots.back().end;
       release = release_at(oldest, std::max(ready_ns, last_end));
       if (release.at_ns && !release.slot) release.at_ns = ready_ns;
       if (!release.slot) return release;
@@ -60,15 +62,34 @@ public:
     if (release.slot) left_ = leaving_;
   }
 
-  // Puts a mode in force from the next cycle on.
-  void switch_mode(std::size_t mode, std::int64_t now_ns) {
-    if (mode != (changes.empty() ? gate.first_mode : changes.back().second))
-      remember(changes, Change{now_ns, mode});
+  // Starts cycles at another phase, from the first such start at `from_ns` or later on.
+  void set_phase(std::int64_t phase_ns, std::int64_t from_ns) {
+    const auto phase = modulo(phase_ns, gate.cycle_ns);
+    const auto start_ns = from_ns + modulo(phase - from_ns, gate.cycle_ns);
+    schedules.change(start_ns, &Schedule::phase_ns, phase);
+  }
+
+  // Moves the slots of cycles that start at `from_ns` or later from where the gate has them.
+  // Nothing changes where they would leave the cycle.
+  void move_slots(std::int64_t by_ns, std::int64_t from_ns) {
+    if (gate.may_move(by_ns)) schedules.change(from_ns, &Schedule::moved_ns, by_ns);
+  }
+
+  // Puts a mode in force in cycles that start at `from_ns` or later.
+  void switch_mode(std::size_t mode, std::int64_t from_ns) {
+    schedules.change(from_ns, &Schedule::mode, std::optional<std::size_t>(mode));
+  }
+
+  // Notes where cycles start, if the stamp of a message shows it. Returns where they do at its
+  // arrival.
+  std::int64_t see_phase(std::int64_t arrival_ns, Maybe stamp_ns) {
+    if (gate.counts_from(stamp_ns, arrival_ns))
+      schedules.see_phase(modulo(*stamp_ns, gate.cycle_ns), arrival_ns);
+    return schedules.in_force(arrival_ns).phase_ns;
   }
 
   const Gate gate;
-  std::deque<Change> changes;
-  std::deque<Move> moves;
+  Schedules schedules;      // what holds from which cycle on
   std::int64_t free_ns{0};  // when the thread was done with the message before
 
 private:
@@ -102,9 +123,9 @@ struct Outcome {
 
 // The messages that wait at a gate, and its decisions about them.
 template <typename Message>
-class Queue : public Turns {
+class Queue : public Decisions {
 public:
-  explicit Queue(Gate served) : Turns(std::move(served)), phase_ns(gate.phase_ns) {}
+  explicit Queue(Gate served) : Decisions(std::move(served)) {}
 
   // Uses no stamps until all messages under way have come: the wall clock was stepped.
   void doubt_stamps(std::int64_t now_ns) {
@@ -115,16 +136,16 @@ public:
   std::optional<Outcome<Message>> arrive(Message message, std::int64_t arrival_ns, Maybe stamp_ns,
                                          Maybe source_timestamp = {}, Maybe lost = {}) {
     if (arrival_ns < unsure_until_ns_) stamp_ns.reset();
+    const std::int64_t phase_ns = see_phase(arrival_ns, stamp_ns);
     waiting.push_back(
         {{arrival_ns, stamp_ns, phase_ns}, std::move(message), source_timestamp, lost, number_++});
-    if (gate.counts_from(stamp_ns, arrival_ns)) phase_ns = *stamp_ns % gate.cycle_ns;
     if (waiting.size() <= gate.depth) return std::nullopt;
     Release release = release_at(waiting.front(), arrival_ns);
     release.drop(Dropped::overflowed);
     return Outcome<Message>{take_oldest(), release, arrival_ns};
   }
 
-  Release decide() { return Turns::decide(waiting.front()); }
+  Release decide() { return Decisions::decide(waiting.front()); }
 
   bool replaced(const Release & release, std::int64_t now_ns) const {
     return std::any_of(waiting.begin() + 1, waiting.end(),
@@ -138,7 +159,6 @@ public:
     return take_oldest();
   }
 
-  std::int64_t phase_ns;
   std::deque<Waiting<Message>> waiting;
 
 private:

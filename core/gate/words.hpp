@@ -70,7 +70,7 @@ inline constexpr std::int64_t stall_ns = 100000;
 inline constexpr std::int64_t step_ns = 500000;
 inline constexpr std::int64_t look_ns = 50000000;
 inline constexpr std::int64_t others_ns = 2000000;
-inline constexpr std::int64_t changes = 64;
+inline constexpr std::int64_t schedules = 64;
 inline constexpr std::int64_t early_divisor = 5;
 
 }  // namespace schema

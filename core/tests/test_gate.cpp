@@ -16,19 +16,27 @@ Gate gate_with(std::vector<Slot> slots, std::int64_t cycle_ns) {
   return gate;
 }
 
+// The schedules of a gate whose second mode is announced at a time.
+Schedules switched_at(const Gate & gate, std::int64_t from_ns) {
+  Schedules schedules(gate);
+  schedules.change(from_ns, &Schedule::mode, std::optional<std::size_t>(1));
+  return schedules;
+}
+
 void early_messages_wait_and_late_ones_overrun() {
   Gate gate = gate_with({{60, 61}}, 100);
-  EXPECT(release_of(gate, 1040, 1000, {}, 1040, 0).at_ns == 1060);
-  EXPECT(release_of(gate, 1070, 1000, {}, 1070, 0).at_ns == 1160);
-  EXPECT(release_of(gate, 1070, 1000, {}, 1070, 0).overrun == Policy::wait);
-  EXPECT(release_of(gate, 1140, 1100, {}, 1140, 0, {{1050, 10}}).at_ns == 1170);
+  EXPECT(release_of(gate, 1040, 1000, Schedules(gate), 1040, 0).at_ns == 1060);
+  EXPECT(release_of(gate, 1070, 1000, Schedules(gate), 1070, 0).at_ns == 1160);
+  EXPECT(release_of(gate, 1070, 1000, Schedules(gate), 1070, 0).overrun == Policy::wait);
+  EXPECT(release_of(gate, 1140, 1100, Schedules({0, 0, 10, {}}), 1140, 0).at_ns == 1170);
   gate.overrun = Policy::discard;
-  EXPECT(release_of(gate, 1070, 1000, {}, 1070, 0).dropped == Dropped::discarded);
+  EXPECT(release_of(gate, 1070, 1000, Schedules(gate), 1070, 0).dropped == Dropped::discarded);
 }
 
 void slots_count_from_the_phase_where_a_stamp_is_of_no_use() {
   const Gate gate = gate_with({{60, 61}}, 100);
-  const auto release = release_of(gate, 5040, 1000, {}, 5040, 20);  // more than 10 cycles old
+  const auto release =
+      release_of(gate, 5040, 1000, Schedules(gate), 5040, 20);  // more than 10 cycles old
   EXPECT(release.anchor == Anchor::cycle);
   EXPECT(release.origin_ns == 5020);
   EXPECT(release.at_ns == 5080);
@@ -37,10 +45,25 @@ void slots_count_from_the_phase_where_a_stamp_is_of_no_use() {
 void each_mode_has_its_slot() {
   Gate gate = gate_with({{20, 21}, {60, 61}}, 100);
   gate.modes = {"city", "highway"};
-  gate.bands = {1, 0};
+  gate.mode_slots = {1, 0};
   gate.late = Policy::next_slot;
-  EXPECT(release_of(gate, 1110, 1100, {{1050, 1}}, 1110, 0).at_ns == 1120);
-  EXPECT(release_of(gate, 1110, 1100, {{1150, 1}}, 1110, 0).at_ns == 1160);
+  EXPECT(release_of(gate, 1110, 1100, switched_at(gate, 1050), 1110, 0).at_ns == 1120);
+  EXPECT(release_of(gate, 1110, 1100, switched_at(gate, 1150), 1110, 0).at_ns == 1160);
+}
+
+void what_is_announced_ahead_gets_later_changes_too() {
+  Schedules schedules(Schedule{0, 7, 0, {}});
+  schedules.change(200, &Schedule::moved_ns, 10);
+  schedules.change(100, &Schedule::phase_ns, 50);
+  EXPECT(schedules.in_force(-5).phase_ns == 7);
+  EXPECT(schedules.in_force(99).phase_ns == 7);
+  EXPECT(schedules.in_force(100).phase_ns == 50 && schedules.in_force(100).moved_ns == 0);
+  EXPECT(schedules.in_force(200).phase_ns == 50 && schedules.in_force(200).moved_ns == 10);
+  schedules.see_phase(3, 50);  // a good stamp, in a cycle of before
+  EXPECT(schedules.in_force(50).phase_ns == 3 && schedules.in_force(100).phase_ns == 50);
+  for (std::int64_t from_ns = 300; from_ns < 400; ++from_ns)
+    schedules.change(from_ns, &Schedule::moved_ns, from_ns);
+  EXPECT(schedules.in_force(0).moved_ns == 400 - schema::schedules);  // the oldest that is known
 }
 
 void the_newest_leaves_for_those_before_it() {
@@ -92,6 +115,7 @@ int main() {
   early_messages_wait_and_late_ones_overrun();
   slots_count_from_the_phase_where_a_stamp_is_of_no_use();
   each_mode_has_its_slot();
+  what_is_announced_ahead_gets_later_changes_too();
   the_newest_leaves_for_those_before_it();
   the_oldest_has_no_room();
   gates_without_sense_are_refused();

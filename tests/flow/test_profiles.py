@@ -22,7 +22,7 @@ from chainshaper.planning import (
     plan_chain,
     plan_warnings,
 )
-from chainshaper.planning.margins import late_share
+from chainshaper.planning.late_shares import late_share
 from chainshaper.planning.profile import deciding_cycles, interfering_callback, other_beginnings
 from chainshaper.planning.request import on_cores
 from chainshaper.values import events

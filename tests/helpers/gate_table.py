@@ -3,16 +3,37 @@
 from collections import deque
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import yaml
 
 from chainshaper.robot.decision import Release, missed
-from chainshaper.robot.gate import Gate, Modes
+from chainshaper.robot.gate import Gate, GateModes
 from chainshaper.robot.waiting import Queue
 
 MS = 1_000_000
 PUBLISHING_NS = MS // 8
+
+
+What: TypeAlias = Literal["mode", "moved", "phase"]
+
+
+@dataclass(frozen=True)
+class Change:
+    """What changes in a gate's schedule from when on (ns): its mode, slots or phase."""
+
+    from_ns: int
+    what: What
+    value: int | str
+
+    def put_into(self, queue: Queue) -> None:
+        """Change the schedule of a gate."""
+        if isinstance(self.value, str):
+            assert queue.switch(self.value, self.from_ns)
+        elif self.what == "moved":
+            queue.move_slots(self.value, self.from_ns)
+        else:
+            queue.set_phase(self.value, self.from_ns)
 
 
 @dataclass(frozen=True)
@@ -21,12 +42,15 @@ class Case:
 
     gate: Gate
     arrivals: tuple[tuple[int, int | None], ...]
-    changes: tuple[tuple[int, str], ...] = ()
-    moves: tuple[tuple[int, int], ...] = ()
+    changes: tuple[Change, ...] = ()
     steps: tuple[int, ...] = ()  # of the wall clock, which the first message behind it shows
     name: str = ""
     leave: tuple[int | str, ...] = ()
     late_ns: int = 0  # a thread that slept wakes up so late
+
+    def changes_of(self, what: What) -> list[Change]:
+        """Those of one kind."""
+        return [change for change in self.changes if change.what == what]
 
 
 @dataclass(frozen=True)
@@ -55,14 +79,17 @@ def _ns(time: float) -> int:
 def _case(entry: dict[str, Any]) -> Case:
     known = dict(entry["gate"])
     slots = tuple((_ns(start), _ns(end)) for start, end in known.pop("slots"))
-    modes = Modes(**known.pop("modes")) if "modes" in known else None
+    modes = GateModes(**known.pop("modes")) if "modes" in known else None
     gate = Gate(slots=slots, cycle_ns=_ns(known.pop("cycle")), modes=modes, **known)
     both = [come if isinstance(come, list) else [come, come] for come in entry["arrivals"]]
     return Case(
         gate=gate,
         arrivals=tuple((_ns(arrival), _ns(stamp)) for arrival, stamp in both),
-        changes=tuple((_ns(time), mode) for time, mode in entry.get("changes", ())),
-        moves=tuple((_ns(time), _ns(by)) for time, by in entry.get("moves", ())),
+        changes=tuple(
+            Change(_ns(time), what, value if isinstance(value, str) else _ns(value))
+            for time, change in entry.get("changes", ())
+            for what, value in change.items()
+        ),
         steps=tuple(_ns(time) for time in entry.get("steps", ())),
         name=entry["name"],
         leave=tuple(one if isinstance(one, str) else _ns(one) for one in entry["leave"]),
@@ -72,8 +99,8 @@ def _case(entry: dict[str, Any]) -> Case:
 def walk(case: Case, publishing_ns: int = PUBLISHING_NS) -> list[Outcome]:
     """What the Python gate does, without a clock; in the order in which messages come."""
     queue, now = Queue(case.gate), 0
-    queue.changes.extend(case.changes)
-    queue.moves.extend(case.moves)
+    for change in case.changes:
+        change.put_into(queue)
     found: dict[int, Outcome] = {}
     coming, steps = deque(enumerate(case.arrivals)), deque(case.steps)
 

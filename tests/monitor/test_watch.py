@@ -173,10 +173,15 @@ def test_a_process_that_ends_or_is_killed_is_left_and_another_is_found(tmp_path:
     for number in (1, 2):
         with running(10_000):
             watch._searched_ns = 0
-            seen = watched(watch, "its cycles", lambda seen, most=8 * number: cycles(seen) > most)
+            enough = 8 * number
+
+            def counted(seen: Seen, enough: int = enough) -> bool:
+                return cycles(seen) > enough
+
+            looks = watched(watch, "its cycles", counted)
             # That the first is still there is what makes the second run worth a look.
             assert len(watch.processes) == number
-            assert seen[-1].chains[0].problem is None, "what has ended is no second path"
+            assert looks[-1].chains[0].problem is None, "what has ended is no second path"
     watch._searched_ns = 0
     watch._latest = dict.fromkeys(watch._latest, 0)  # as twelve seconds later
     watch.read()

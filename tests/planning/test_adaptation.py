@@ -19,8 +19,8 @@ from scipy.special import bdtrc
 from small_chain import small_chain_plan
 
 from chainshaper.flow.drift import SlotFollower
-from chainshaper.flow.threads import followed_chains
-from chainshaper.planning import margins
+from chainshaper.flow.followed_chains import followed_chains
+from chainshaper.planning.adaptation import Tail
 from chainshaper.planning.chain_plan import (
     Adaptation,
     ChainPlan,
@@ -29,7 +29,7 @@ from chainshaper.planning.chain_plan import (
     revised,
     with_slots,
 )
-from chainshaper.planning.margins import Tail
+from chainshaper.planning.late_shares import most_hits
 from chainshaper.planning.plan import (
     Plan,
     open_until_done,
@@ -40,8 +40,10 @@ from chainshaper.planning.shaping import let_per_chain
 from chainshaper.robot import handover
 from chainshaper.robot.decision import Release
 from chainshaper.robot.handover import Turn
-from chainshaper.robot.waiting import Outcome, Waiting
+from chainshaper.robot.schedules import Schedule, schedule_in_force
+from chainshaper.robot.waiting import Outcome, Queue, Waiting
 from chainshaper.splicing import shaped_outputs
+from chainshaper.splicing.gate_settings import gate_of
 from chainshaper.splicing.shaped_outputs import find_outputs, output_text
 from chainshaper.values.errors import InputError, OperationError
 
@@ -71,7 +73,7 @@ def follow(
     """The moves: behind which latency, and where to."""
     how = {"latest_ns": 10**9, "rules": RULES, **how}
     tail = Tail(how.pop("rules"), promised, round(start), float(np.median(latencies[:99])), **how)
-    return [(n, to) for n, one in enumerate(latencies) if (to := tail.saw(round(one))) is not None]
+    return [(n, to) for n, one in enumerate(latencies) if (to := tail.add(round(one))) is not None]
 
 
 def planned(shape: str, promised: float) -> float:
@@ -291,28 +293,34 @@ def test_a_gate_is_followed_until_the_run_ends_however_it_does(pages: Path) -> N
     with pytest.raises(OperationError, match="no gates publish it now"):
         follow_it()
     turn = Turn("gate", known(plan.shaping_node).output)
+
+    def moved() -> int:
+        turn.follow(queue)
+        return queue.schedules[-1].moved_ns
+
     assert turn.take(None)
     follower = follow_it()
     with pytest.raises(OperationError, match="another run has the slots"):
         follow_it()
-    assert known(turn.moved())[0] == 0
+    queue = Queue(gate_of(plan, known(plan.shaping_node)))
+    assert moved() == 0
     late = Release(25 * MS, 0, slot=None, cycles_waited=0, anchor="cycle", overrun="publish")
     outcome = Outcome(Waiting(b"", arrival_ns=25 * MS, stamp_ns=None, phase_ns=0), late, 0)
     for _ in range(20):
         turn.count(outcome)
-    wait_for(lambda: known(turn.moved())[0] != 0, "a move")
+    wait_for(lambda: moved() != 0, "a move")
     (move,) = follower.moves
-    assert turn.moved() == (move.moved_ns, 1_000)
+    assert queue.schedules[-1] == Schedule(1_000, queue.gate.phase_ns, move.moved_ns)
     assert asked == [move.moved_ns]
     assert 4 * MS <= move.moved_ns <= 8 * MS
     (output,) = find_outputs([str(pages)])
     assert f"its slots are moved by +{move.moved_ns / MS:g} ms" in output_text(output)
     assert json.loads(json.dumps(move.__dict__))["why"] == "its promise did not hold any more"
     follower.end()
-    back, since = known(turn.moved())
-    assert (back, since <= time.monotonic_ns()) == (0, True)
+    assert moved() == 0
+    assert schedule_in_force(queue.schedules, time.monotonic_ns()).moved_ns == 0
     again = follow_it()
-    assert known(turn.moved())[0] == 0, "not where the run before had them"
+    assert moved() == 0, "not where the run before had them"
     again.end()
 
 
@@ -321,4 +329,4 @@ def test_counts_of_chance_are_those_of_the_binomial_distribution() -> None:
         sure = bdtrc(np.arange(trials + 1), trials, probability)
         for doubt in (1e-9, 1e-6, 0.5, 1 - 1e-6):
             expected = np.count_nonzero(sure > doubt)
-            assert margins._by_chance(trials, probability, doubt) == expected
+            assert most_hits(trials, probability, doubt) == expected

@@ -34,6 +34,7 @@ from chainshaper.values.durations import milliseconds
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import Policy
 from chainshaper.values.recording import Recording
+from chainshaper.verify.promises import outputs_due
 from chainshaper.workload.description import Application
 
 
@@ -512,3 +513,31 @@ def test_others_cost_nothing_while_a_chain_waits_for_its_branch(tmp_path: Path) 
     assert 18 * MS <= min(joining.latencies_ns) <= max(joining.latencies_ns) < 19.5 * MS
     assert 18 * MS <= min(alone(joining).latencies_ns) < 19.5 * MS
     assert max(alone(beside).latencies_ns) < 5.5 * MS, "d waited for a"
+
+
+ON_ONE_CORE = """\
+name: a chain whose branches share its core, and another chain on that core
+chain: /a../b../c
+scheduling: {executors: {core: 1, priority: 80}, dds: {core: 0, priority: 90}}
+nodes:
+  a: {callbacks: [{timer: 100ms, execution: {constant: 8ms}, publishes: [/a]}]}
+  side: {callbacks: [{subscription: /a, execution: {constant: 7ms}, publishes: [/side]}]}
+  b: {callbacks: [{subscription: /a, execution: {constant: 2ms}, publishes: [/b]}]}
+  c: {callbacks: [{synchronises: [/b, /side], execution: {constant: 3ms}, publishes: [/c]}]}
+  d: {callbacks: [{timer: 100ms, phase: 50ms, execution: {constant: 5ms}, publishes: [/d]}]}
+"""
+
+
+def test_branches_on_one_core_run_one_behind_the_other(tmp_path: Path) -> None:
+    """a, both branches and c take 8 + 7 + 2 + 3 = 20 ms on their core, not the longest way's 18."""
+    (tmp_path / "app.yaml").write_text(ON_ONE_CORE)
+    application = load_application(tmp_path / "app.yaml")
+    recorded = simulate(application, tmp_path / "rec", cycles=50)
+    profiles = profile_chains(recorded, ("/a../b../c", "/d"))
+    assert 20 * MS <= min(alone(profiles[0]).latencies_ns) < 21.5 * MS
+    request = PlanRequest(anchor="cycle", ideal_machine=True)
+    plan, remarks = plan_application(profiles, request)
+    assert not remarks, "they take turns"
+    shaped = simulate(application, tmp_path / "shaped", plan, cycles=50)
+    measured = measure_latency(shaped, plan.chains[0].chain.spec)
+    assert outputs_due(measured.analysis, plan.chains[0]).missed == 0

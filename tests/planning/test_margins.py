@@ -19,16 +19,16 @@ from chainshaper.planning import (
     plan_shaping,
     plan_warnings,
 )
-from chainshaper.planning.margins import (
+from chainshaper.planning.late_shares import (
     covered_latency,
     cycles_needed,
-    derive_margin,
-    fit_tail,
     independent_cycles,
     late_share,
-    read_latencies,
 )
+from chainshaper.planning.latencies import read_latencies
+from chainshaper.planning.margins import derive_margin
 from chainshaper.planning.plan_file import dump_plan
+from chainshaper.planning.tails import fit_tail
 from chainshaper.values.errors import InputError, OperationError
 
 

@@ -1,5 +1,6 @@
 """Chains longer than their period: the shortest cut, against brute force and by hand; plans."""
 
+import random
 from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
@@ -19,7 +20,7 @@ from chainshaper.planning.overruns import (
     open_until_done,
     plan_warnings,
 )
-from chainshaper.planning.pipeline import Work, opened_early, shortest_cut, work_of
+from chainshaper.planning.pipeline import Work, finished, opened_early, shortest_cut, work_of
 from chainshaper.planning.plan import Plan
 from chainshaper.planning.plan import open_until_done as joint_until_done
 from chainshaper.planning.plan_file import dump_plan, load_plan
@@ -269,3 +270,55 @@ def test_only_a_single_path_that_was_recorded_is_cut() -> None:
     beside = [CallbackTimes(node, 1, 1, 1, 1) for node in ("/n1", "/rear", "/n2")]
     with pytest.raises(InputError, match="waits for /rear beside it, and what these took is not"):
         plan_chain(profile([[80, 80]], callbacks=tuple(beside)), request)
+
+
+@st.composite
+def graphs_on_cores(draw: st.DrawFn) -> tuple[list[tuple[int, ...]], list[int], list[int]]:
+    """A graph whose last step waits for all others, how long each takes, and its core."""
+    count = draw(st.integers(1, 7))
+    after = [
+        tuple(sorted(draw(st.sets(st.integers(0, step - 1), max_size=2)))) if step else ()
+        for step in range(count)
+    ]
+    ends = set(range(count)).difference(*after)
+    steps_ns = [draw(st.integers(1, 9)) for _ in range(count + 1)]
+    cores = [draw(st.integers(0, 2)) for _ in range(count + 1)]
+    return [*after, tuple(sorted(ends))], steps_ns, cores
+
+
+def run_in_order(
+    after: list[tuple[int, ...]], steps_ns: list[int], cores: list[int], urgent: list[int]
+) -> int:
+    """When the last step is over, if each core always runs the most urgent that is ready."""
+    done: dict[int, int] = {}
+    left = dict(enumerate(steps_ns))
+    now = 0
+    while left:
+        running: dict[int, int] = {}
+        for step in sorted(left, key=urgent.__getitem__):
+            if all(before in done for before in after[step]):
+                running.setdefault(cores[step], step)
+        shortest = min(left[step] for step in running.values())
+        now += shortest
+        for step in running.values():
+            left[step] -= shortest
+            if not left[step]:
+                del left[step]
+                done[step] = now
+    return now
+
+
+@given(graphs_on_cores(), st.randoms(use_true_random=False))
+def test_no_order_on_the_cores_ends_a_graph_later(
+    graph: tuple[list[tuple[int, ...]], list[int], list[int]], generator: random.Random
+) -> None:
+    after, steps_ns, cores = graph
+    row = np.array([steps_ns], dtype=np.int64)
+    latest = int(finished(after, row, [0] * len(after), cores)[0, -1])
+    for _ in range(5):
+        urgent = generator.sample(range(len(after)), len(after))
+        assert run_in_order(after, steps_ns, cores, urgent) <= latest
+    on_one = int(finished(after, row, [0] * len(after), [0] * len(after))[0, -1])
+    assert on_one == sum(steps_ns), "one core runs all that the last step waits for"
+    apart = int(finished(after, row, [0] * len(after), range(len(after)))[0, -1])
+    assert apart == int(finished(after, row, [0] * len(after))[0, -1]), "the longest way"

@@ -32,14 +32,16 @@ chainshaper::Outcome<int> outcome(std::optional<chainshaper::Dropped> dropped,
 
 // In place of a gate: writes what it is asked for.
 struct Asked {
-  struct {
+  struct Queue {
     chainshaper::Gate gate;
-  } queue;
-  std::function<void(const chainshaper::Release &, std::int64_t)> on_decision;
-  std::function<std::optional<chainshaper::Move>()> moved;
+    std::int64_t moved_ns{77};
 
-  void set_phase(std::int64_t phase_ns, std::int64_t) { std::cout << phase_ns; }
-  void announce(const std::string & mode, std::int64_t) { std::cout << ' ' << mode; }
+    void set_phase(std::int64_t phase_ns, std::int64_t) { std::cout << phase_ns; }
+    void switch_mode(std::size_t mode, std::int64_t) { std::cout << ' ' << gate.modes[mode]; }
+    void move_slots(std::int64_t by_ns, std::int64_t) { moved_ns = by_ns; }
+  } queue;
+  std::function<void(const chainshaper::Release &)> on_decision;
+  std::function<void()> follow;
 };
 
 // The folder of pages, "shaping", "starting" or "counting", the page's name, the port to listen at, how long to
@@ -49,6 +51,7 @@ int main(int, char ** argv) {
   if (std::string(argv[2]) == "starting") {
     Asked asked;
     asked.queue.gate.modes = {"city", "highway"};
+    asked.queue.gate.cycle_ns = 2;
     turn.go_on(asked);
     return 0;
   }
@@ -58,7 +61,9 @@ int main(int, char ** argv) {
       for (std::int64_t i = 0; i <= number; ++i)
         turn.count(outcome(static_cast<chainshaper::Dropped>(number), number, number % 2 == 1,
                            number));
-    turn.count(outcome({}, {}, false, turn.moved() ? turn.moved()->second : 77));
+    Asked::Queue queue;
+    turn.follow(queue);
+    turn.count(outcome({}, {}, false, queue.moved_ns));
     return 0;
   }
   const int inbox = socket(AF_INET, SOCK_DGRAM, 0);

@@ -19,7 +19,7 @@ from unittest.mock import MagicMock
 
 from chainshaper.robot import handover
 from chainshaper.robot.decision import DROPPED, Release
-from chainshaper.robot.gate import Gate, Modes
+from chainshaper.robot.gate import Gate, GateModes
 from chainshaper.robot.waiting import Outcome, Waiting
 
 
@@ -38,9 +38,9 @@ def main() -> None:
     folder, what, name, port, hold = sys.argv[1:]
     handover.page_folders = lambda: iter([folder])
     if what == "starting":
-        modes, asked = Modes({"city": 0, "highway": 0}, "city"), list[object]()
+        modes, asked = GateModes({"city": 0, "highway": 0}, "city"), list[object]()
         shaper = MagicMock(gate=Gate(((0, 1),), 2, modes=modes))
-        shaper.set_phase = shaper.switch = lambda what, _: asked.append(what)
+        shaper.queue.set_phase = shaper.queue.switch = lambda what, _: asked.append(what)
         handover.Turn(name, "/t5").go_on(shaper)
         print(*asked)  # noqa: T201
         return
@@ -49,8 +49,10 @@ def main() -> None:
         for number, reason in enumerate(DROPPED):
             for _ in range(number + 1):
                 turn.count(outcome(reason, number, late=number % 2 == 1, latency_ns=number))
-        moved, _ = turn.moved() or (77, 0)
-        turn.count(outcome(None, None, late=False, latency_ns=moved))
+        moves = [77]
+        queue = MagicMock(move_slots=lambda by_ns, _: moves.append(by_ns))
+        turn.follow(queue)
+        turn.count(outcome(None, None, late=False, latency_ns=moves[-1]))
         return
     inbox = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     if what == "shaping":

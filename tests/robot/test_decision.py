@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from gate_table import Case, walk
+from gate_table import Case, Change, walk
 from hypothesis import given
 from hypothesis import strategies as st
 from known import known
@@ -16,7 +16,16 @@ from passing import decided, held, serialized
 
 from chainshaper.robot import shaper as shaping
 from chainshaper.robot.decision import Release, missed, release_of
-from chainshaper.robot.gate import LATE, OVERRUNS, Gate, Modes, Overrun
+from chainshaper.robot.gate import LATE, OVERRUNS, Gate, GateModes, Overrun
+from chainshaper.robot.schedules import (
+    SCHEDULES,
+    Schedule,
+    Schedules,
+    first_schedule,
+    schedule_in_force,
+    with_change,
+    with_phase_seen,
+)
 from chainshaper.robot.serialized import origin_of, text_of
 from chainshaper.robot.shaper import Shaper
 
@@ -28,13 +37,21 @@ BANDS = Gate(slots=((20, 25), (25, 30), (80, 100)), cycle_ns=100)
 TWO = Gate(slots=((20, 30), (60, 61)), cycle_ns=100)
 DISCARD, PUBLISH = replace(TWO, overrun="discard"), replace(TWO, overrun="publish")
 # The last slot is the city's.
-MODES = Modes(bands={"city": 2, "village": 1, "highway": 0}, default="city")
+MODES = GateModes(slots={"city": 2, "village": 1, "highway": 0}, default="city")
 MODAL = Gate(slots=((20, 21), (40, 42), (60, 61)), cycle_ns=100, modes=MODES)
 MODAL_MS = Gate(
     slots=tuple((start * MS, end * MS) for start, end in MODAL.slots),
     cycle_ns=100 * MS,
     modes=MODES,
 )
+
+
+def announced(*changes: tuple[int, str]) -> Schedules:
+    """The schedules of a gate whose modes were announced then."""
+    schedules: Schedules = (first_schedule(MODAL),)
+    for from_ns, mode in changes:
+        schedules = with_change(schedules, from_ns, mode=mode)
+    return schedules
 
 
 def with_late(late: str, overrun: Overrun = "wait") -> Gate:
@@ -143,8 +160,8 @@ def _inside_a_slot(gate: Gate, since_origin: int) -> bool:
         ({"overrun": "drop"}, "choose one of wait, discard, publish"),
         ({"due_cycles": -1}, "due beforehand"),
         ({"depth": 0}, "for one at least"),
-        ({"modes": ({"city": 3}, "city")}, "numbered 0 to 0"),
-        ({"modes": ({"city": -1}, "city")}, "numbered 0 to 0"),
+        ({"modes": ({"city": 3}, "city")}, "numbered 1 to 1"),
+        ({"modes": ({"city": -1}, "city")}, "numbered 1 to 1"),
         ({"modes": ({"city": 0}, "sea")}, "'sea' has no band: choose one of city"),
         ({"modes": ({"city": 0}, "city", "never")}, "choose one of wait, .*next-slot"),
     ],
@@ -152,7 +169,7 @@ def _inside_a_slot(gate: Gate, since_origin: int) -> bool:
 def test_gates_that_make_no_sense_are_refused(changes: dict[str, Any], reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         replace(
-            ONE, **changes | ({"modes": Modes(*changes["modes"])} if "modes" in changes else {})
+            ONE, **changes | ({"modes": GateModes(*changes["modes"])} if "modes" in changes else {})
         )
 
 
@@ -231,30 +248,31 @@ def test_who_wakes_behind_the_slot_discards_what_came_in_time(
 def test_a_message_leaves_in_the_slot_of_its_mode_or_as_said(  # noqa: PLR0917 - a row of the table
     late: str, overrun: Overrun, arrival: int, leaves_at: int | None, slot: int | None, treated: str
 ) -> None:
-    release = release_of(with_late(late, overrun), arrival, 1000, changes=[(0, "village")])
+    release = release_of(with_late(late, overrun), arrival, 1000, announced((0, "village")))
     assert (release.at_ns, release.slot, release.overrun) == (leaves_at, slot, treated)
     assert release.mode == "village"
 
 
 def test_a_change_is_in_force_from_the_next_cycle_on() -> None:
-    changes = [(1000, "highway"), (1150, "village")]
+    schedules = announced((1000, "highway"), (1150, "village"))
     for cycle, mode in ((900, "city"), (1000, "highway"), (1100, "highway"), (1200, "village")):
         for gate, stamp in ((MODAL, cycle), (replace(MODAL, anchor="cycle"), None)):
-            assert release_of(gate, cycle + 10, stamp, changes).mode == mode
-    late = release_of(with_late("publish"), 1175, 1000, changes)
+            assert release_of(gate, cycle + 10, stamp, schedules).mode == mode
+    late = release_of(with_late("publish"), 1175, 1000, schedules)
     assert (late.mode, late.at_ns) == ("highway", 1175), "that of the cycle it belongs to"
 
 
 LATER = st.integers(0, 400)
-CHANGES = st.lists(st.tuples(LATER, st.sampled_from(sorted(MODES.bands)))).map(sorted)
+CHANGES = st.lists(st.tuples(LATER, st.sampled_from(sorted(MODES.slots)))).map(sorted)
 
 
 @given(st.sampled_from(LATE), st.sampled_from(OVERRUNS), LATER, LATER, CHANGES)
 def test_a_cycle_has_one_mode_and_messages_leave_in_its_slot_unless_late(
     late: str, overrun: Overrun, arrival: int, other: int, changes: list[tuple[int, str]]
 ) -> None:
-    release = release_of(with_late(late, overrun), arrival, 0, changes)
-    band = MODES.bands[known(release.mode)]
+    schedules = announced(*changes)
+    release = release_of(with_late(late, overrun), arrival, 0, schedules)
+    band = MODES.slots[known(release.mode)]
     start, end = MODAL.slots[band]
     assert (release.overrun is None) == (arrival < end)
     if release.overrun is None:
@@ -262,8 +280,64 @@ def test_a_cycle_has_one_mode_and_messages_leave_in_its_slot_unless_late(
     elif release.slot is not None and late != "next-slot":
         assert release.slot == band
     gate = replace(with_late(late), anchor="cycle")
-    one, two = (release_of(gate, time, None, changes) for time in (arrival, other))
+    one, two = (release_of(gate, time, None, schedules) for time in (arrival, other))
     assert one.origin_ns != two.origin_ns or one.mode == two.mode
+
+
+# Schedules --------------------------------------------------------------------------------------
+
+
+def test_the_last_schedule_that_had_begun_is_in_force() -> None:
+    first = Schedule(100, phase_ns=7)
+    schedules = with_change((first,), 200, moved_ns=5)
+    schedules = with_change(schedules, 200, phase_ns=1)
+    for start_ns, phase_ns, moved_ns in ((-5, 7, 0), (100, 7, 0), (199, 7, 0), (200, 1, 5)):
+        schedule = schedule_in_force(schedules, start_ns)
+        assert (schedule.phase_ns, schedule.moved_ns) == (phase_ns, moved_ns)
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 9), st.sampled_from(["phase_ns", "moved_ns", "mode"]), LATER))
+)
+def test_of_each_kind_the_change_announced_last_holds(changes: list[tuple[int, str, int]]) -> None:
+    """Whatever else was announced, and in which order: worked out by looking at all of them."""
+    schedules: Schedules = (Schedule(0, phase_ns=0, mode="0"),)
+    for from_ns, what, value in changes:
+        if what == "phase_ns":
+            schedules = with_change(schedules, from_ns, phase_ns=value)
+        elif what == "moved_ns":
+            schedules = with_change(schedules, from_ns, moved_ns=value)
+        else:
+            schedules = with_change(schedules, from_ns, mode=str(value))
+    assert [one.from_ns for one in schedules] == sorted(one.from_ns for one in schedules)
+    for start_ns in range(10):
+        wanted: dict[str, int] = {"phase_ns": 0, "moved_ns": 0, "mode": 0}
+        wanted |= {what: value for from_ns, what, value in changes if from_ns <= start_ns}
+        found = schedule_in_force(schedules, start_ns)
+        assert (found.phase_ns, found.moved_ns, found.mode) == (
+            *(wanted["phase_ns"], wanted["moved_ns"]),
+            str(wanted["mode"]),
+        )
+
+
+def test_what_changes_nothing_adds_nothing_and_only_the_last_are_remembered() -> None:
+    schedules: Schedules = (Schedule(0, phase_ns=0),)
+    assert with_change(schedules, 50, moved_ns=0) is schedules
+    for from_ns in range(2 * SCHEDULES):
+        schedules = with_change(schedules, from_ns, moved_ns=from_ns + 1)
+        assert with_change(schedules, from_ns + 1, moved_ns=from_ns + 1) is schedules
+    assert len(schedules) == SCHEDULES
+    assert schedule_in_force(schedules, 0).moved_ns == SCHEDULES + 1, "the oldest that is known"
+
+
+def test_a_good_stamp_shows_where_cycles_start_until_a_phase_is_announced() -> None:
+    schedules = with_change((Schedule(0, phase_ns=0),), 200, moved_ns=5)
+    schedules = with_change(schedules, 300, phase_ns=40)
+    schedules = with_phase_seen(schedules, 7, arrival_ns=150)
+    assert [one.phase_ns for one in schedules] == [7, 7, 40]
+    schedules = with_phase_seen(schedules, 8, arrival_ns=250)
+    assert [one.phase_ns for one in schedules] == [7, 8, 40]
+    assert with_phase_seen(schedules, 8, arrival_ns=299) is schedules
 
 
 # Messages, and a gate at work -------------------------------------------------------------------
@@ -302,7 +376,7 @@ def test_a_new_phase_is_in_force_from_the_next_cycle_that_begins_there(
     phase: int, first_ms: int
 ) -> None:
     shaper = Shaper(Gate(((60 * MS, 61 * MS),), 100 * MS, anchor="cycle"))
-    shaper.set_phase(phase * MS, 100 * MS if phase == 13 else 100 * MS + 1)
+    shaper.queue.set_phase(phase * MS, 100 * MS if phase == 13 else 100 * MS + 1)
     before = decided(shaper, b"", first_ms * MS - 1)
     assert before.origin_ns == 100 * MS, "what comes until then belongs to a cycle as it was"
     assert decided(shaper, b"", first_ms * MS).origin_ns == first_ms * MS
@@ -341,28 +415,29 @@ def test_a_shaper_follows_the_modes_that_are_announced(monkeypatch: pytest.Monke
     monkeypatch.setattr(shaping, "clock_offset", lambda: 0)
     shaper = Shaper(MODAL_MS)
     assert decided(shaper, serialized(1000 * MS), 1010 * MS).at_ns == 1060 * MS
-    assert shaper.switch("highway", 1050 * MS)
+    assert shaper.queue.switch("highway", 1050 * MS)
     assert decided(shaper, serialized(1000 * MS), 1055 * MS).at_ns == 1060 * MS, "it was begun"
     assert decided(shaper, serialized(1100 * MS), 1110 * MS).at_ns == 1120 * MS
-    assert shaper.switch("highway", 1150 * MS), "no change, but a mode that exists"
+    assert shaper.queue.switch("highway", 1150 * MS), "no change, but a mode that exists"
     for unknown in ("sea", None):
-        assert not shaper.switch(unknown, 1150 * MS)
+        assert not shaper.queue.switch(unknown, 1150 * MS)
     assert decided(shaper, serialized(1200 * MS), 1210 * MS).mode == "highway"
-    assert not Shaper(ONE).switch("city", 5)
+    assert not Shaper(ONE).queue.switch("city", 5)
 
 
 @given(
     overrun=st.sampled_from(["wait", "publish"]),
     arrivals=st.lists(st.integers(0, 2_000), min_size=1, max_size=12).map(sorted),
     ages=st.lists(st.integers(0, 150), min_size=12, max_size=12),
-    moves=st.lists(st.tuples(st.integers(0, 2_000), st.integers(-60, 39)), max_size=5).map(sorted),
+    moves=st.lists(st.tuples(st.integers(0, 2_000), st.integers(-60, 39)), max_size=5),
 )
 def test_moves_lose_double_and_reorder_no_message(
     overrun: Overrun, arrivals: list[int], ages: list[int], moves: list[tuple[int, int]]
 ) -> None:
     gate = Gate(slots=((60, 61),), cycle_ns=100, overrun=overrun, depth=12)
     stamped = tuple((at, at - age) for at, age in zip(arrivals, ages, strict=False))
-    outcomes = walk(Case(gate, stamped, moves=tuple(moves)), publishing_ns=1)
+    changes = tuple(Change(from_ns, "moved", by_ns) for from_ns, by_ns in moves)
+    outcomes = walk(Case(gate, stamped, changes), publishing_ns=1)
     left = [outcome.left_ns for outcome in outcomes]
     assert all(known(time) >= at for time, at in zip(left, arrivals, strict=True))
     assert sorted(set(left), key=known) == left, "each once, in the order in which they came"

@@ -20,16 +20,23 @@ from cpp_program import compiled
 from processes import wait_for
 
 from chainshaper.robot.decision import DROPPED
+from chainshaper.robot.gate import Gate
 from chainshaper.robot.handover import (
+    CHANGES,
     MOVING,
+    NEW_MOVE,
+    NEW_PHASE,
     RING,
     STANDING_BY,
     VERSION,
+    Change,
     Page,
     Standby,
     Turn,
     open_page,
 )
+from chainshaper.robot.schedules import Schedule, first_schedule
+from chainshaper.robot.waiting import Queue
 from chainshaper.splicing.shaped_outputs import remove_abandoned_pages
 
 pytestmark = pytest.mark.timed
@@ -245,7 +252,7 @@ def test_a_page_that_is_removed_while_it_is_used_is_made_again(
     output.kill("shaping")
     output.send_many(5)
     output.check(begun)
-    assert [path.name for path in folder.iterdir()] == ["t5.0.v4"]
+    assert [path.name for path in folder.iterdir()] == [f"t5.0.v{VERSION}"]
 
 
 def test_pages_that_no_process_has_are_removed_and_the_folder_behind_is_not_made(
@@ -279,12 +286,51 @@ def test_a_node_that_finds_its_page_made_anew_puts_its_slots_back(folder: Path) 
     assert turn.take(1)
     follower = open_page("t5", "/t5")
     assert follower.lock(MOVING)
-    follower["moved_ns"], follower["moved_from_ns"] = 5, 1000
-    assert turn.moved() == (5, 1000)
+    follower.ask(Change(1000, NEW_MOVE, 5))
+    queue = Queue(Gate(((0, 1),), 100))
+    turn.follow(queue)
+    assert queue.schedules[-1] == Schedule(1000, phase_ns=0, moved_ns=5)
     shutil.rmtree(folder)
     turn.done(1)
-    assert (turn.moved() or (None,))[0] == 0
-    assert turn.moved() is None
+    turn.follow(queue)
+    assert queue.schedules[-1].moved_ns == 0
+    assert 0 <= time.monotonic_ns() - queue.schedules[-1].from_ns < 1000 * MS
+    known_before = queue.schedules
+    turn.follow(queue)
+    assert queue.schedules is known_before
+
+
+def test_a_gate_is_asked_for_a_phase_while_it_runs_and_a_new_one_is_not() -> None:
+    asking, cycle_ns = open_page("t5", "/t5"), 100
+    asking.ask(Change(1000, NEW_PHASE, 7))
+    turn, queue = Turn("t5", "/t5"), Queue(Gate(((0, 1),), cycle_ns))
+    turn.follow(queue)
+    assert queue.schedules == (first_schedule(queue.gate),), "that was asked of the gate before"
+    for number in range(CHANGES + 10):
+        asking.ask(Change(2000 + 1000 * number, NEW_PHASE, number))
+    turn.follow(queue)
+    latest = queue.schedules[-1]
+    assert latest.phase_ns == CHANGES + 9
+    assert latest.from_ns == 2000 + 1000 * (CHANGES + 9) + CHANGES + 9, "the next such start"
+
+
+def test_who_asks_at_the_same_time_loses_nothing(folder: Path) -> None:
+    Turn("t5", "/t5")
+
+    def ask(value: int) -> None:
+        with closing(Page(str(folder), f"t5.0.v{VERSION}", flags=os.O_RDWR)) as page:
+            for from_ns in range(10):
+                page.ask(Change(from_ns, NEW_MOVE, value))
+
+    threads = [threading.Thread(target=ask, args=[value]) for value in range(5)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    asked = open_page("t5", "/t5").asked()
+    assert len(asked) == 50
+    for value in range(5):
+        assert [change.from_ns for change in asked if change.value == value] == [*range(10)]
 
 
 def test_a_standby_that_finds_its_page_made_anew_begins_anew_but_is_silent_still(
@@ -339,7 +385,7 @@ def test_only_a_node_of_the_same_launch_goes_on_in_its_cycle_and_mode(
         return done.stdout.decode().strip()
 
     assert started() == ""
-    page = Page(str(folder), "t5.0.v4", "/t5", os.O_RDWR)
+    page = Page(str(folder), f"t5.0.v{VERSION}", "/t5", os.O_RDWR)
     for age_ns, before, wanted in (
         (0, [], "12345 highway"),
         (40_000 * MS, [], ""),  # its parent may be that of all launches
@@ -357,21 +403,22 @@ def test_what_a_node_counts_is_in_the_page_for_those_who_look(
     command = [*program, "counting", "t5", "0", "0"]
     for times in (1, 2):  # a node that its launch starts again goes on counting
         if times == 2:
-            page = Page(str(folder), "t5.0.v4", "/t5", os.O_RDWR)
+            page = Page(str(folder), f"t5.0.v{VERSION}", "/t5", os.O_RDWR)
             page["until_ns"] = time.monotonic_ns()
         subprocess.run(command, check=True, timeout=60)
-        page = Page(str(folder), "t5.0.v4")
+        page = Page(str(folder), f"t5.0.v{VERSION}")
         assert [page[reason] for reason in DROPPED] == [times, 2 * times, 3 * times]
         assert page["published"] == times
         assert page["lost_by_dds"] == times * (0 + 2 * 1 + 3 * 2)
         assert page["late"] == times * 2
-    page = Page(str(folder), "t5.0.v4", "/t5", os.O_RDWR)
-    page["moved_ns"], page["moved_from_ns"] = -5, time.monotonic_ns() + 10**15
+    page = Page(str(folder), f"t5.0.v{VERSION}", "/t5", os.O_RDWR)
+    page.ask(Change(time.monotonic_ns() + 10**15, NEW_MOVE, -5))
     assert page.lock(MOVING)
     subprocess.run(command, check=True, timeout=60)
     page.unlock(MOVING)  # who moved the slots is gone
     subprocess.run(command, check=True, timeout=60)
-    page["moved_from_ns"] = 0  # what follows is being written
+    assert page.lock(MOVING)
+    page["asked"] = 0  # nothing was asked for on this page
     subprocess.run(command, check=True, timeout=60)
     latencies, each = page.latest("measured", 0), [0, 1, 1, 2, 2, 2]
     assert latencies == [one for last in (77, 77, -5, 0, 77) for one in (*each, last)]
@@ -383,11 +430,11 @@ def test_each_launch_counts_from_nought(folder: Path, program: list[str]) -> Non
     launch = ["sh", "-c", '"$@"; true', "launch"]  # a parent of its own
     for _ in range(3):
         subprocess.run([*launch, *command], check=True, timeout=60)
-        page = Page(str(folder), "t5.0.v4")
+        page = Page(str(folder), f"t5.0.v{VERSION}")
         counts = [page[name] for name in ("starts", "published", *DROPPED, "lost_by_dds", "late")]
         assert counts == [1, 1, 1, 2, 3, 0 + 2 * 1 + 3 * 2, 2]
     assert page["measured"] == 3 * 7, "who reads latencies goes on where it was"
-    page = Page(str(folder), "t5.0.v4", "/t5", os.O_RDWR)
+    page = Page(str(folder), f"t5.0.v{VERSION}", "/t5", os.O_RDWR)
     assert page.lock()  # a node of another launch is in force: its counts stay
     subprocess.run([*launch, *program, "starting", "t5", "0", "0"], check=True, timeout=60)
     assert page["published"] == 1
@@ -409,14 +456,14 @@ def test_a_folder_that_is_not_ours_alone_is_not_used(
     if how == "mode":
         folder.chmod(0o777)
     if how == "foreign page":
-        (folder / "t5.0.v4").touch()
+        (folder / f"t5.0.v{VERSION}").touch()
     if how in ("owner", "foreign page"):
-        os.chown(folder if how == "owner" else folder / "t5.0.v4", 65534, -1)
+        os.chown(folder if how == "owner" else folder / f"t5.0.v{VERSION}", 65534, -1)
     with pytest.raises(OSError, match=r"outputs: .*(not a folder|exists|not a file of)"):
         open_page("t5", "/t5")
     spare = str(tmp_path / "spare")
     monkeypatch.setattr(FOLDERS, lambda: iter([str(folder), spare]))
-    assert open_page("t5", "/t5").path == f"{spare}/t5.0.v4"
+    assert open_page("t5", "/t5").path == f"{spare}/t5.0.v{VERSION}"
 
 
 def test_a_page_for_which_there_is_no_room_is_made_elsewhere_and_found_there(
@@ -425,7 +472,7 @@ def test_a_page_for_which_there_is_no_room_is_made_elsewhere_and_found_there(
     folders = [f"{full_disk}/outputs", str(folder)]
     monkeypatch.setattr(FOLDERS, lambda: iter(folders))
     page = open_page("t5", "/t5")
-    assert page.path == f"{folder}/t5.0.v4"
+    assert page.path == f"{folder}/t5.0.v{VERSION}"
     folders[0] = f"{folder.parent}/room"
     assert open_page("t5", "/t5").path == page.path
 

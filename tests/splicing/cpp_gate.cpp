@@ -50,7 +50,7 @@ Gate read_gate() {
   if (const auto modes = number(); modes > 0) {
     for (auto mode = 0; mode < modes; ++mode) {
       gate.modes.push_back("mode" + std::to_string(mode));
-      gate.bands.push_back(static_cast<std::size_t>(number()));
+      gate.mode_slots.push_back(static_cast<std::size_t>(number()));
     }
     gate.first_mode = static_cast<std::size_t>(number());
     gate.late = static_cast<Policy>(number());
@@ -67,12 +67,15 @@ struct Outcome {
 void walk() {
   Queue<std::size_t> queue(read_gate());
   for (auto count = number(); count > 0; --count) {
-    const auto time = number();
-    queue.changes.emplace_back(time, static_cast<std::size_t>(number()));
-  }
-  for (auto count = number(); count > 0; --count) {
-    const auto time = number();
-    queue.moves.emplace_back(time, number());
+    const auto from_ns = number();
+    const auto what = number();  // in the order of `CHANGED`
+    const auto value = number();
+    if (what == 0)
+      queue.switch_mode(static_cast<std::size_t>(value), from_ns);
+    else if (what == 1)
+      queue.move_slots(value, from_ns);
+    else
+      queue.set_phase(value, from_ns);
   }
   std::deque<std::int64_t> steps;
   for (auto count = number(); count > 0; --count) steps.push_back(number());
@@ -151,7 +154,7 @@ void write_log(const std::string & path, std::int64_t most_bytes, int rows) {
   gate.cycle_ns = 1'000'000'000;
   gate.overrun = Policy::discard;
   gate.modes = {"city", "highway"};
-  gate.bands = {0, 0};
+  gate.mode_slots = {0, 0};
   gate.first_mode = 1;
   gate.late = Policy::discard;
   Shaper<int> shaper(gate, 0);

@@ -9,14 +9,23 @@ from pathlib import Path
 
 import pytest
 from cpp_program import compiled
-from gate_table import PUBLISHING_NS, Case, Outcome, cases, walk
+from gate_table import PUBLISHING_NS, Case, Change, Outcome, What, cases, walk
 
 from chainshaper.robot.decision import DROPPED
-from chainshaper.robot.gate import ANCHORS, INTO_OPEN_SLOT, LATE, MESSAGES, OVERRUNS, Gate, Modes
+from chainshaper.robot.gate import (
+    ANCHORS,
+    INTO_OPEN_SLOT,
+    LATE,
+    MESSAGES,
+    OVERRUNS,
+    Gate,
+    GateModes,
+)
 from chainshaper.robot.serialized import origin_of
 from chainshaper.sources.gate_log import read_gate_log
 
 CASES = 5000
+CHANGED = ("mode", "moved", "phase")
 
 
 SOURCE = Path(__file__).parent / "cpp_gate.cpp"
@@ -30,7 +39,7 @@ def driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def as_text(case: Case) -> str:
     """A case as the driver reads it; modes are named by their numbers."""
     gate, modes = case.gate, case.gate.modes
-    names = [] if modes is None else list(modes.bands)
+    names = [] if modes is None else list(modes.slots)
     words: list[int | str] = [
         *(ANCHORS.index(gate.anchor), gate.phase_ns, LATE.index(gate.overrun), gate.due_cycles),
         *(MESSAGES.index(gate.messages), gate.depth, gate.cycle_ns),
@@ -39,10 +48,11 @@ def as_text(case: Case) -> str:
         len(names),
     ]
     if modes is not None:
-        words += [*modes.bands.values(), names.index(modes.default), LATE.index(modes.late)]
+        words += [*modes.slots.values(), names.index(modes.default), LATE.index(modes.late)]
     words += [len(case.changes)]
-    words += [word for time, mode in case.changes for word in (time, names.index(mode))]
-    words += [len(case.moves), *(word for move in case.moves for word in move)]
+    for change in case.changes:
+        value = names.index(change.value) if isinstance(change.value, str) else change.value
+        words += [change.from_ns, CHANGED.index(change.what), value]
     words += [len(case.steps), *case.steps, PUBLISHING_NS, case.late_ns, len(case.arrivals)]
     words += [word for arrival, stamp in case.arrivals for word in (arrival, _or_dash(stamp))]
     return " ".join(map(str, words))
@@ -51,7 +61,7 @@ def as_text(case: Case) -> str:
 def as_answer(case: Case, outcome: Outcome) -> str:
     """What becomes of a message, as the driver prints it."""
     release, dash = outcome.release, _or_dash
-    names = [] if case.gate.modes is None else list(case.gate.modes.bands)
+    names = [] if case.gate.modes is None else list(case.gate.modes.slots)
     words = [
         *(dash(outcome.left_ns), dash(release.at_ns), release.origin_ns, dash(release.slot)),
         *(release.cycles_waited, ANCHORS.index(release.anchor), _place(LATE, release.overrun)),
@@ -74,12 +84,12 @@ def _any_case(draw: random.Random) -> Case:
     cycle = draw.randint(2, 40)
     cuts = sorted(draw.sample(range(cycle + 1), min(cycle + 1, draw.choice([2, 4, 6]))))
     slots = tuple((a * scale, b * scale) for a, b in zip(cuts[::2], cuts[1::2], strict=False))
-    modes, changes = None, []
+    modes, changes = None, list[Change]()
     if draw.random() < 0.5:
         bands = {f"mode{n}": draw.randrange(len(slots)) for n in range(draw.randint(1, 3))}
-        modes = Modes(bands, draw.choice(list(bands)), draw.choice(LATE))
-        times = sorted(draw.randint(0, 300) * scale for _ in range(draw.randint(0, 4)))
-        changes = [(time, draw.choice(list(bands))) for time in times]
+        modes = GateModes(bands, draw.choice(list(bands)), draw.choice(LATE))
+        times = [draw.randint(0, 300) * scale for _ in range(draw.randint(0, 4))]
+        changes += [Change(time, "mode", draw.choice(list(bands))) for time in times]
     gate = Gate(
         slots=slots,
         cycle_ns=cycle * scale,
@@ -97,12 +107,18 @@ def _any_case(draw: random.Random) -> Case:
     late_ns = draw.choice([0, 0, draw.randint(1, 40) * scale])
     arrivals = tuple(zip(times, stamps, strict=True))
     earliest, latest = -slots[0][0], gate.cycle_ns - slots[-1][1]
-    moves = sorted(
-        (draw.randint(0, 300) * scale, draw.randint(earliest, latest))
-        for _ in range(draw.choice([0, 1, 3]))
-    )
+    limits: dict[What, tuple[int, int]] = {
+        "moved": (earliest, latest),
+        "phase": (-100 * scale, 100 * scale),
+    }
+    for what, (low, high) in limits.items():
+        changes += [
+            Change(draw.randint(0, 300) * scale, what, draw.randint(low, high))
+            for _ in range(draw.choice([0, 1, 3]))
+        ]
+    draw.shuffle(changes)  # as they are announced
     steps = tuple(sorted(draw.randint(0, 300) * scale for _ in range(draw.choice([0, 0, 0, 1, 2]))))
-    return Case(gate, arrivals, tuple(changes), tuple(moves), steps, late_ns=late_ns)
+    return Case(gate, arrivals, tuple(changes), steps, late_ns=late_ns)
 
 
 def test_both_gates_decide_alike(driver: Path) -> None:

@@ -18,7 +18,7 @@ from strangers import NOBODY, needs_root, strange
 
 from chainshaper.planning import ChainPlan
 from chainshaper.planning.chain_plan import revised
-from chainshaper.robot.handover import MOVING, VERSION, Page, open_page
+from chainshaper.robot.handover import MOVING, NEW_MOVE, VERSION, Change, Page, open_page
 from chainshaper.sources.gate_log import read_gate_log, releases_so_far
 from chainshaper.splicing.shaped_outputs import FollowedOutput, ask_phase, find_outputs, output_text
 from chainshaper.splicing.shaping_process import ShapingProcess, write_shaping_process
@@ -182,6 +182,28 @@ def test_what_a_stopped_node_finds_when_it_goes_on_is_neither_doubled_nor_counte
     assert any("it hangs, or was stopped" in text for text in standby.logged)
 
 
+def test_what_came_before_the_standby_is_not_published_behind_what_that_has_published(
+    tmp_path: Path, plan: ChainPlan
+) -> None:
+    """Both are started again; the node's reader has a message which the standby's has not."""
+    process, beside = written(plan, tmp_path)
+    with running_node(beside, tmp_path) as standby, running_node(process, tmp_path) as shaping:
+        shaping.process.send_signal(signal.SIGSTOP)
+        say(1, shaping)
+        for number in (2, 3):
+            say(number, shaping, standby)
+            standby.hear_published()
+        say(4, shaping)
+        shaping.process.send_signal(signal.SIGCONT)
+        shaping.hear_published()
+        shaping.end()
+        standby.end()
+    assert (came(shaping), came(standby)) == ([4], [2, 3])
+    gate = read_gate_log(tmp_path / "gate.csv")
+    assert gate["source_timestamp"].to_list() == [1001, 1004]
+    assert gate["dropped"].to_list() == ["replaced", None], "it is counted"
+
+
 def test_with_the_fallback_silence_nothing_is_published_and_all_is_counted(
     tmp_path: Path, plan: ChainPlan
 ) -> None:
@@ -304,7 +326,8 @@ def test_a_stranger_s_page_says_nothing_of_our_outputs() -> None:
         try:
             assert page.lock()
             assert page.lock(MOVING)
-            page["holder"], page["moved_ns"], page["moved_from_ns"] = stranger.pid, 50_000_000, 1
+            page["holder"] = stranger.pid
+            page.ask(Change(1, NEW_MOVE, 50_000_000))
             (output,) = (output for output in find_outputs() if output.topic == topic)
             assert (output.user, output.shaping_node) == (NOBODY, stranger.pid)
             text = output_text(output)

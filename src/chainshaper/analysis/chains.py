@@ -3,15 +3,16 @@
 A chain is written ``FIRST..LAST``, with more way points (topics, services or nodes) where several
 paths match. One that begins with a topic starts at the callback that publishes it, and every chain
 ends with the publication of its last topic (paper, section 2.3): of a last node that is the topic
-it publishes, or, if it publishes nothing, the one it subscribes to. A service is its request as
-long as the chain goes on behind it, and its response where the chain ends. Of nodes of one name
-that ran at the same time, ``/talker@4711`` is the one in process 4711.
+it publishes, or, if it publishes nothing, the one it subscribes to. A service as a way point means
+its request, and as the last one its response. Where several nodes of one name ran at the same time,
+``/talker@4711`` is the one in process 4711.
 
 The number of simple paths grows exponentially with cycles and fan-in, and counting them is #P-hard.
-Without cycles every step forward leads to an end, so listing needs no search. With cycles the
-shortest paths are listed first; if they are few, a search backwards from the ends at every step
-avoids dead ends; both have a budget. Counting and the heaviest path come from dynamic programming
-over the edges that lead forwards in one order of the vertices: exact without cycles, else a bound.
+Without cycles every step forward leads to an end, so listing is a plain walk. With cycles the
+shortest paths are listed first; if they are few, all paths are searched, and a search backwards
+from the ends at every step avoids dead ends. Both searches have a budget. The count and the
+heaviest path come from dynamic programming over the edges that lead forwards in one order of the
+vertices: exact without cycles, else a bound.
 """
 
 from collections import deque
@@ -37,27 +38,28 @@ from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import STANDBY
 from chainshaper.values.yaml_file import PlainData, compose, read_text
 
-HANDFUL = 5  # so many names or paths a message lists
-STEPS = 30_000  # for short paths where there are cycles, about 5 µs each
-SEARCHES = 100  # backwards, for all paths then, about 1 ms each
+HANDFUL = 5  # the most names or paths that a message lists
+STEPS = 30_000  # budget of the search for the shortest paths, about 5 µs each
+SEARCHES = 100  # budget of backward searches when all paths are listed, about 1 ms each
 CLOSE = 0.6  # likeness (0 to 1) from which a name is worth mentioning
 WORSE = 0.15  # how much less alike than the best one a name may be
 
 Vertex: TypeAlias = int | str  # a callback's id, or a topic's name
-State: TypeAlias = tuple[Vertex, int]  # a vertex, and how many way points have been met with it
+State: TypeAlias = tuple[Vertex, int]  # a vertex, and how many way points the path met until there
 GraphPath: TypeAlias = tuple[Vertex, ...]
 _V = TypeVar("_V")
 
 
 def close_names(name: str, names: Iterable[str]) -> list[str]:
-    """Up to three of ``names`` that are like ``name``, the likeliest first."""
-    scores = {other: _likeness(name, other) for other in names}
+    """Return up to three of ``names`` that resemble ``name``, the most alike first."""
+    scores = {candidate: _likeness(name, candidate) for candidate in names}
     least = max(CLOSE, max(scores.values(), default=0.0) - WORSE)
-    close = [other for other, score in scores.items() if score >= least]
-    return sorted(close, key=lambda other: (-scores[other], other))[:3]
+    close = [candidate for candidate, score in scores.items() if score >= least]
+    return sorted(close, key=lambda candidate: (-scores[candidate], candidate))[:3]
 
 
 def _likeness(first: str, second: str) -> float:
+    """How alike two names are, from 0 to 1."""
     a, b = (text.lower().strip("/") for text in (first, second))
     last_a, last_b = a.rpartition("/")[2], b.rpartition("/")[2]
     return max(
@@ -90,24 +92,21 @@ class SeveralPathsError(InputError):
 
 @dataclass(frozen=True)
 class ChainEnumeration:
-    """The chains between two places of a graph.
+    """The chains between two places of a graph."""
 
-    ``chains`` are all of them if ``complete``, else the first ones found. ``count`` says how many
-    there are (not ``exact``: at least). ``heaviest`` has the largest sum of mean response times
-    (``heaviest_ns``) among the counted and the listed chains; None without response times.
-    """
-
-    chains: tuple[Chain, ...]
+    chains: tuple[Chain, ...]  # all of them if `complete`, else those that were listed first
     complete: bool
-    count: int
+    count: int  # how many there are; if not `exact`, at least
     exact: bool
-    heaviest: Chain | None
-    heaviest_ns: float | None
+    heaviest: Chain | None  # of all that were counted or listed; None without response times
+    heaviest_ns: float | None  # the sum of its callbacks' mean response times
 
 
 def find_chain(graph: ApplicationGraph, spec: str) -> Chain:
-    """The one chain of ``graph`` that ``spec`` means; of a shaping node that a standby has stood in
-    for, it is the path by that node, and traversals go on through the standby where that published.
+    """Find the one chain of ``graph`` that ``spec`` means.
+
+    A path through a shaping node's standby is left out where there is the path through the shaping
+    node: traversals go on through the standby where that published.
 
     Raises InputError: a topic or node that does not exist, no path, or only a cyclic one.
     SeveralPathsError: several.
@@ -117,8 +116,8 @@ def find_chain(graph: ApplicationGraph, spec: str) -> Chain:
     chains = list(dict.fromkeys(_chain(graph, spec, path) for path in paths))
     if not chains:
         raise search.no_path()
-    standbys = {one.id for one in graph.callbacks if one.node.endswith(STANDBY)}
-    chains = [one for one in chains if standbys.isdisjoint(one.callbacks)] or chains
+    standbys = {callback.id for callback in graph.callbacks if callback.node.endswith(STANDBY)}
+    chains = [chain for chain in chains if standbys.isdisjoint(chain.callbacks)] or chains
     if len(chains) > 1 or not complete:
         raise SeveralPathsError(_ambiguous(graph, spec, chains, complete))
     return chains[0]
@@ -131,7 +130,7 @@ def enumerate_chains(
     limit: int = 100,
     response_ns: Mapping[int, float] | None = None,
 ) -> ChainEnumeration:
-    """The chains from ``start`` to ``end`` (topics or nodes), at most ``limit`` of them.
+    """List the chains from ``start`` to ``end`` (topics or nodes), at most ``limit`` of them.
 
     Without ``start`` chains begin at callbacks that no other callback of the application
     triggers, without ``end`` they end with topics from which no callback goes on. ``response_ns``
@@ -164,6 +163,7 @@ def enumerate_chains(
 
 
 def _chain(graph: ApplicationGraph, spec: str | None, path: GraphPath) -> Chain:
+    """Make a chain of a path; without ``spec`` its text is that of its own way points."""
     callbacks = tuple(vertex for vertex in path if isinstance(vertex, int))
     topics = tuple(vertex for vertex in path if isinstance(vertex, str))
     chain = Chain(spec or "", callbacks[: len(topics)], topics)
@@ -179,20 +179,21 @@ def _way_points(graph: ApplicationGraph, chain: Chain) -> Iterator[str]:
 
 
 def _ambiguous(graph: ApplicationGraph, spec: str, chains: Sequence[Chain], complete: bool) -> str:
+    """Message for a text that several chains match: each of them, with what sets it apart."""
     more = "" if complete and len(chains) <= HANDFUL else "at least "
     lines = [f"chain {spec!r}: {more}{len(chains)} paths match; add a way point:"]
     shown = chains[:HANDFUL]
-    paths = [graph.path(one) for one in shown]
+    paths = [graph.path(chain) for chain in shown]
     passed = [
-        (*one.topics, *(c.node for c in path), *(graph.node_text(c) for c in path))
-        for one, path in zip(shown, paths, strict=True)
+        (*chain.topics, *(c.node for c in path), *(graph.node_text(c) for c in path))
+        for chain, path in zip(shown, paths, strict=True)
     ]
     for chain, path, names in zip(shown, paths, passed, strict=True):
-        others = {name for other in passed if other is not names for name in other}
-        own = next((name for name in names if name not in others), None)
+        elsewhere = {name for of_path in passed if of_path is not names for name in of_path}
+        only_here = next((name for name in names if name not in elsewhere), None)
         points = tuple(_way_points(graph, chain))
-        remedy = f"  (only this one passes {own})"
-        if own is None:
+        remedy = f"  (only this one passes {only_here})"
+        if only_here is None:
             remedy = f"  (write {'..'.join(points)})"
             if points == chain.topics:
                 remedy = _without_way_point(path, paths)
@@ -202,9 +203,11 @@ def _ambiguous(graph: ApplicationGraph, spec: str, chains: Sequence[Chain], comp
 
 
 def _without_way_point(path: Sequence[Callback], paths: Sequence[Sequence[Callback]]) -> str:
-    """Which callback sets a path apart that no way point does."""
-    others = {callback.id for one in paths if one is not path for callback in one}
-    apart = next((one for one in path if one.id not in others), None)
+    """Name the callback that sets a path apart where no way point does."""
+    elsewhere = {
+        callback.id for other_path in paths if other_path is not path for callback in other_path
+    }
+    apart = next((callback for callback in path if callback.id not in elsewhere), None)
     if apart is None:
         return ""  # way points together tell it apart
     return f"  (by {apart.symbol or f'callback {apart.handle:#x}'} of {apart.node})"
@@ -217,11 +220,22 @@ def _some(names: Iterable[str]) -> str:
 
 
 class _Search:
-    """All paths of a graph from a start through the way points ``stages`` to an end.
+    """All paths of a graph from a start, through the way points (``stages``), to an end.
 
-    A path alternates between callbacks and topics. One that starts before the first stage must go
-    there at once (a chain that begins with a topic starts at the callback that publishes it).
-    Only states between a start and an end are in ``successors``, the nearest to an end first.
+    A path alternates between callbacks and topics. A path that starts before the first stage must
+    reach it in one step: a chain that begins with a topic starts at the callback that publishes it.
+
+    * ``stages``: each way point's name, and the vertices that it stands for.
+    * ``subscribers``: the callbacks that each topic triggers.
+    * ``going_on``: topics that trigger a callback which publishes something.
+    * ``calls``: whether some client's callback publishes, so that paths may go through a service.
+    * ``ignored``: topics of ROS 2 itself, but for those that are way points.
+    * ``furthest``, ``reached``: how many way points were met at most, and the vertices where so.
+    * ``ends``, ``distance``: the states where a path may end, and the steps to the nearest of them.
+    * ``successors``: for each state from which an end can be reached, the next ones, the nearest to
+      an end first; ``roots`` are those where paths start.
+    * ``edges``, ``order``, ``cyclic``: the same between vertices, their ranks in a depth-first
+      search (:func:`depth_first_order`), and whether there is a cycle.
     """
 
     def __init__(
@@ -271,10 +285,11 @@ class _Search:
         self.cyclic = any(rank[a] >= rank[v] for v, onward in self.edges.items() for a in onward)
 
     def wrong(self, problem: str) -> InputError:
+        """Make an error that says what is wrong with the text of the chain."""
         return InputError(f"chain {self.spec!r}: {problem}")
 
     def _stage(self, name: str) -> tuple[str, frozenset[Vertex]]:
-        """What a way point stands for: a topic, a service's messages, or a node's callbacks."""
+        """Find what a way point stands for: a topic, a service's messages or a node's callbacks."""
         nodes: dict[str, set[int]] = {node.name: set() for node in self.graph.nodes}
         topics, services = set(self.graph.topics), set[str | None]()
         for callback in self.graph.callbacks:
@@ -307,24 +322,29 @@ class _Search:
             hint = f"did you mean {' or '.join(close)}?"
         raise self.wrong(f"no topic or node is called {name}; {hint}")
 
-    def _in_process(self, node: str, own: Iterable[int], process: str) -> frozenset[Vertex]:
-        """Of a node's callbacks those in a process."""
-        found = [one for one in own if process in map(str, self.callbacks[one].processes)]
-        if not found:
-            ran = sorted({pid for one in own for pid in self.callbacks[one].processes})
+    def _in_process(self, node: str, callbacks: Iterable[int], process: str) -> frozenset[Vertex]:
+        """Select those of a node's callbacks that ran in a process."""
+        in_process = [
+            number for number in callbacks if process in map(str, self.callbacks[number].processes)
+        ]
+        if not in_process:
+            ran = sorted({pid for number in callbacks for pid in self.callbacks[number].processes})
             there = ", ".join(f"{node}@{pid}" for pid in ran) or node
             raise self.wrong(f"{node} did not run in process {process}; write {there}")
-        return frozenset[Vertex](found)
+        return frozenset[Vertex](in_process)
 
     def _starts(self, name: str, vertices: frozenset[Vertex]) -> set[int]:
+        """Callbacks where a path begins whose first way point stands for ``vertices``."""
         if not any(isinstance(vertex, str) for vertex in vertices):
-            own = {vertex for vertex in vertices if isinstance(vertex, int)}
-            # What a node does with a response, it began with the request.
-            return {one for one in own if self.callbacks[one].kind != "client"} or own
+            of_node = {vertex for vertex in vertices if isinstance(vertex, int)}
+            # A client's callback is no start: what it works on began with the request.
+            return {
+                number for number in of_node if self.callbacks[number].kind != "client"
+            } or of_node
         starts = {
-            one.id
-            for one in self.graph.callbacks
-            if vertices & (set(one.publishes) - set(one.passes_on))
+            callback.id
+            for callback in self.graph.callbacks
+            if vertices & (set(callback.publishes) - set(callback.passes_on))
         }
         if not starts:
             writers = ", ".join(self.graph.publishers.get(name, ())) or "no node in the recording"
@@ -352,7 +372,7 @@ class _Search:
         if self.any_end:
             return callback is None and vertex not in self.going_on
         _, last = self.stages[-1]
-        if all(isinstance(one, str) for one in last):
+        if all(isinstance(vertex_of_last, str) for vertex_of_last in last):
             return vertex in last
         # The last way point is a node: its callback was met, then comes the topic it publishes.
         return callback is None or not callback.publishes
@@ -376,7 +396,7 @@ class _Search:
         return tuple(sorted((s for s in states if s in distance), key=distance.__getitem__))
 
     def no_path(self) -> InputError:
-        """Why there is no path."""
+        """Make an error that says why there is no path."""
         if self.roots and not self.cyclic:
             return self.wrong(
                 "it leads through a service to a node that did not call it; responses go back to"
@@ -399,21 +419,26 @@ class _Search:
         return self.wrong(f"{way}; from there the data gets as far as {_some(stops)}")
 
     def listed(self, limit: int) -> tuple[tuple[GraphPath, ...], bool, int]:
-        """Up to ``limit`` paths (with cycles the shortest ones), whether they are all, and how many
-        were met on the way."""
+        """List up to ``limit`` paths, with cycles the shortest ones.
+
+        Also return whether these are all, and how many paths the search met.
+        """
         shortest, met = list[GraphPath](), 0
         if self.cyclic:
             shortest, met, complete = self._shortest(limit)
             if complete or len(shortest) == limit:
                 return tuple(shortest), complete and met == len(shortest), met
-        others, complete = self._depth_first(limit)
-        paths = tuple(dict.fromkeys((*shortest, *others)))
+        searched, complete = self._depth_first(limit)
+        paths = tuple(dict.fromkeys((*shortest, *searched)))
         return paths[:limit], complete, max(met, len(paths))
 
     def _depth_first(self, limit: int) -> tuple[list[GraphPath], bool]:
-        """Up to ``limit`` paths, and whether that is all. Where there are cycles, every step goes
-        where an end can still be reached without meeting the path again."""
-        found: list[GraphPath] = []
+        """List up to ``limit`` paths, and return whether that is all.
+
+        Where there are cycles, every step goes where an end can still be reached without meeting
+        the path again.
+        """
+        paths: list[GraphPath] = []
         searches = 0
         stack: list[tuple[GraphPath, State]] = [((), root) for root in reversed(self.roots)]
         while stack:
@@ -421,40 +446,43 @@ class _Search:
             path, following = (*before, state[0]), self.successors[state]
             if state in self.ends:
                 if self._returns(path):
-                    if len(found) == limit:
-                        return found, False
-                    found.append(path)
+                    if len(paths) == limit:
+                        return paths, False
+                    paths.append(path)
                 continue
             if self.cyclic:
                 if searches == SEARCHES:
-                    return found, False
+                    return paths, False
                 searches += 1
                 free = {s: f for s, f in self.successors.items() if s[0] not in path}
                 useful = _distances(free, self.ends & free.keys())
                 leading = (after for after in following if after in useful)
                 following = tuple(sorted(leading, key=useful.__getitem__))
             stack += [(path, after) for after in reversed(following)]
-        return found, True
+        return paths, True
 
     def _returns(self, path: GraphPath) -> bool:
-        """Whether responses go to the nodes that sent their requests."""
+        """Whether each response on the path goes to the node that sent the request."""
         callers: dict[Vertex, tuple[int, str]] = {}
         for vertex, after in pairwise((*path, "")):
             if not isinstance(vertex, int):
                 continue
-            one = self.callbacks[vertex]
-            here = one.pid, one.node
-            if one.kind == "client" and callers.get(f"{one.topic}{REQUEST}", here) != here:
+            callback = self.callbacks[vertex]
+            sender = callback.pid, callback.node
+            if (
+                callback.kind == "client"
+                and callers.get(f"{callback.topic}{REQUEST}", sender) != sender
+            ):
                 return False
-            callers[after] = here
+            callers[after] = sender
         return True
 
     def _shortest(self, limit: int) -> tuple[list[GraphPath], int, bool]:
-        """The shortest paths: up to ``limit`` of them, how many were met, whether that is all.
+        """List up to ``limit`` of the shortest paths; return how many were met, and if that is all.
 
-        Best first: the path goes on whose nearest end would make it the shortest.
+        A best-first search: the path is continued whose nearest end would make it the shortest.
         """
-        found: list[GraphPath] = []
+        paths: list[GraphPath] = []
         met = step = 0
         waiting: list[tuple[int, int, int, GraphPath, State]]
         waiting = [(self.distance[root], 0, n, (), root) for n, root in enumerate(self.roots)]
@@ -463,23 +491,24 @@ class _Search:
             path = (*before, state[0])
             if state in self.ends and self._returns(path):
                 met += 1
-                found += [path] * (len(found) < limit)
+                if len(paths) < limit:
+                    paths.append(path)
             for after in self.successors[state]:
                 if step == STEPS:
-                    return found, met, False
+                    return paths, met, False
                 step += 1
                 if after[0] not in path:
                     length = len(path) + self.distance[after]
                     heappush(waiting, (length, -len(path), step, path, after))
-        return found, met, True
+        return paths, met, True
 
     def counted(self, weights: Mapping[int, float]) -> tuple[int, GraphPath, float]:
-        """Number of paths, the heaviest of them, and its weight (the sum over its callbacks).
+        """Count the paths; return the number, the heaviest path, and the sum of its weights.
 
-        Paths on which a response goes to another node than the request's count as well. If
-        ``cyclic``, of those that never step back in one order of the vertices: that of a
-        depth-first search which goes to the nearest ends first or, if more paths agree with it,
-        last.
+        Paths on which a response goes to another node than the one that asked count as well. If
+        ``cyclic``, only paths count that never step back in an order of the vertices. There are two
+        such orders, of depth-first searches that go to the nearest ends first, or last; the larger
+        number counts, and the heavier path.
         """
         orders = [self.order]
         if self.cyclic:
@@ -492,26 +521,27 @@ class _Search:
     def _counted_in(
         self, order: Mapping[Vertex, int], weights: Mapping[int, float]
     ) -> tuple[int, GraphPath, float]:
-        best: dict[State, tuple[int, GraphPath, float]] = {}
+        """Do :meth:`counted` for the edges that lead forwards in one order of the vertices."""
+        of_state: dict[State, tuple[int, GraphPath, float]] = {}
         for state in sorted(self.successors, key=lambda s: (order[s[0]], -s[1])):
             vertex = state[0]
-            own = weights.get(vertex, 0.0) if isinstance(vertex, int) else 0.0
+            own_weight = weights.get(vertex, 0.0) if isinstance(vertex, int) else 0.0
             count, weight = (1, 0.0) if state in self.ends else (0, -1.0)
             onward: GraphPath = ()
             for after in self.successors[state]:
-                if after in best and order[after[0]] < order[vertex]:
-                    paths, path, below = best[after]
+                if after in of_state and order[after[0]] < order[vertex]:
+                    paths, path, below = of_state[after]
                     count += paths
                     if paths and below > weight:
                         onward, weight = path, below
-            best[state] = (count, (vertex, *onward), own + weight)
-        found = [best[root] for root in self.roots if best[root][0]]
-        _, heaviest, weight = max(found, key=lambda one: one[2], default=(0, (), 0.0))
-        return sum(count for count, _, _ in found), heaviest, weight
+            of_state[state] = (count, (vertex, *onward), own_weight + weight)
+        of_roots = [of_state[root] for root in self.roots if of_state[root][0]]
+        _, heaviest, weight = max(of_roots, key=lambda result: result[2], default=(0, (), 0.0))
+        return sum(count for count, _, _ in of_roots), heaviest, weight
 
 
 def _distances(successors: Mapping[State, tuple[State, ...]], ends: set[State]) -> dict[State, int]:
-    """Steps from every state to the nearest end, for those from which one can be reached."""
+    """Count the steps from each state to the nearest end; states that reach none are left out."""
     before: dict[State, list[State]] = {}
     for state, following in successors.items():
         for after in following:
@@ -528,8 +558,9 @@ def _distances(successors: Mapping[State, tuple[State, ...]], ends: set[State]) 
 
 
 def depth_first_order(edges: Mapping[_V, Sequence[_V]], roots: Sequence[_V]) -> dict[_V, int]:
-    """Vertices ranked as a depth-first search leaves them; all edges lead to lower ranks if they
-    can, and those that close cycles do not.
+    """Rank vertices in the order in which a depth-first search leaves them.
+
+    Edges lead to lower ranks, but for those that close a cycle.
     """
     rank: dict[_V, int] = {}
     entered: set[_V] = set()
@@ -589,7 +620,7 @@ class _ArchitectureOfGalactic(BaseModel):
 
 
 def load_named_paths(file: str | Path) -> dict[str, str]:
-    """The named paths of a CARET architecture file: path name → chain as we write it.
+    """Read the named paths of a CARET architecture file: path name → text of the chain.
 
     Each node of a path becomes a way point together with the topic it publishes. A last node that
     publishes nothing ends the chain with the topic it subscribes to. Galactic's files name the
@@ -629,8 +660,8 @@ def load_named_paths(file: str | Path) -> dict[str, str]:
 def _paths_of_callbacks(file: Path, architecture: _ArchitectureOfGalactic) -> dict[str, str]:
     """The chains of paths that name their callbacks, as ``/node/subscription_callback_0``.
 
-    A message leads from a callback to the next one of another node, so its topic is a way point;
-    within a node what passes is a variable, which the node's name stands for.
+    A message leads from a callback to the next node's, so its topic is a way point. Between two
+    callbacks of one node there is a variable: the node is the way point.
     """
     nodes = {node.node_name: node for node in architecture.nodes}
     chains = {}
@@ -659,11 +690,11 @@ def _paths_of_callbacks(file: Path, architecture: _ArchitectureOfGalactic) -> di
 
 
 def _published(node: _Node, callback_name: str) -> str | None:
-    """The topic that a callback publishes; None where the file does not say which, or none."""
-    own = [
-        one.topic_name
-        for one in node.publishes
-        if callback_name in {one.callback_name, *one.callback_names}
+    """The topic that a callback publishes; None if the file has none, or does not say which."""
+    of_callback = [
+        publication.topic_name
+        for publication in node.publishes
+        if callback_name in {publication.callback_name, *publication.callback_names}
     ]
-    topics = own or [one.topic_name for one in node.publishes]
+    topics = of_callback or [publication.topic_name for publication in node.publishes]
     return topics[0] if len(topics) == 1 else None

@@ -1,23 +1,23 @@
-"""Where a recording's events contradict each other: the one place that looks for it.
+"""Contradictions between a recording's events: all of them are looked for here.
 
-* **A message was taken before it was published**: a clock, or an event, is wrong. A plan from it is
-  refused.
-* **The wall clock was moved** while messages were recognised by its time alone: they are followed
-  with the clock as it was then, and those that are not certain are left out.
-* **A callback ran, but no event tells of its takes**: it is followed where publication and callback
-  determine each other; where not, a plan is refused.
+* **A message was taken before it was published**: a clock, or an event, is wrong. No plan can be
+  made from it.
+* **The wall clock was moved** while messages were recognised by its time alone: messages are
+  followed with the clock as it was then, and those that are not certain are left out.
+* **A callback ran, but no event shows a take of its message**: messages are followed if
+  publications and callbacks determine each other; else no plan can be made from them.
 * **A timer's callback starts at another period than declared**: the period that its starts show
-  counts; where they are not regular, a plan is refused.
-* **A callback spans its executor's next take, or its search for work**: its end is left out; where
-  only the search for work says so, a plan is refused. Where no event was lost, it spins an executor
-  itself.
-* **A callback ran inside itself in one thread**: the outer instances have no end. A plan is
-  refused, but where events were lost, which looks alike.
-* **Events lie behind the end of their packet**: the decoder drops them, and the recording's own
-  notes say so.
+  counts; if they are not regular, no plan can be made.
+* **A callback spans its executor's next take, or its search for work**: its end is left out; if
+  only the search for work contradicts it, no plan can be made. Where no event was lost, the
+  callback spins an executor itself, and keeps its end.
+* **A callback ran inside itself in one thread**: the outer instances have no end. No plan can be
+  made, unless events were lost, which looks the same.
+* **Events lie behind the end of their packet**: the decoder drops them, and a note of the recording
+  says so.
 
-Each has a note, which says where, how often and when. A callback whose own events are at odds is no
-evidence to plan from: :func:`refuse_contradicted` is asked by all that build on it.
+Each contradiction has a note that says where, how often and when. All that build on callbacks call
+:func:`refuse_contradicted` first: a callback whose events contradict each other is no evidence.
 """
 
 from collections.abc import Collection, Iterable, Iterator
@@ -28,7 +28,7 @@ import polars as pl
 from chainshaper.analysis.lost_ends import LostEnds
 from chainshaper.analysis.matching import first_after, latest_before
 from chainshaper.analysis.objects import Objects
-from chainshaper.analysis.periods import OtherPeriod, other_periods
+from chainshaper.analysis.periods import ShownPeriod, shown_periods
 from chainshaper.analysis.unseen_takes import UnseenTakes
 from chainshaper.analysis.wall_clock import StampedMessages
 from chainshaper.values import events
@@ -39,17 +39,12 @@ from chainshaper.values.errors import InputError
 
 @dataclass(frozen=True)
 class Contradiction:
-    """One contradiction in a recording's events.
+    """A contradiction in a recording's events."""
 
-    ``callbacks`` are the ids of those that it is about, ``note`` says it in plain words,
-    ``refused`` that nothing can be planned from them. ``period_ns`` is the period that a timer's
-    starts show instead of the declared one.
-    """
-
-    callbacks: frozenset[int]
-    note: str
-    refused: bool
-    period_ns: int | None = None
+    callbacks: frozenset[int]  # the ids of those that it is about
+    note: str  # in plain words
+    refused: bool  # whether no plan can be made from these callbacks
+    period_ns: int | None = None  # that a timer's starts show instead of the declared period
 
 
 def contradictions(
@@ -63,14 +58,14 @@ def contradictions(
     unseen: tuple[UnseenTakes, ...],
     stamped: StampedMessages | None,
 ) -> tuple[Contradiction, ...]:
-    """All contradictions in a recording whose events have been resolved."""
+    """Find all contradictions in a recording whose events have been resolved."""
     nodes = objects.callbacks.unique("callback_id", keep="first", maintain_order=True)
-    periods = tuple(map(_of_another_period, other_periods(nodes, instances, taken)))
+    periods = tuple(map(_of_another_period, shown_periods(nodes, instances, taken)))
     nodes = with_shown_periods(nodes, periods)
     return (
         *_moved_clock(stamped),
         *_before_their_publication(taken, published),
-        *(_without_takes(one) for one in unseen),
+        *(_without_takes(subscription) for subscription in unseen),
         *periods,
         *_longer_than_they_ran(nodes, ends),
         *_inside_themselves(tables, nodes, ends),
@@ -78,21 +73,25 @@ def contradictions(
 
 
 def refuse_contradicted(
-    found: Collection[Contradiction], callbacks: Collection[int], recording: object
+    contradictions: Collection[Contradiction], callbacks: Collection[int], recording: object
 ) -> None:
-    """Raises InputError: what is to be built on ``callbacks`` contradicts itself."""
+    """Refuse to build on callbacks whose events contradict each other.
+
+    Raises InputError: a contradiction about one of ``callbacks``.
+    """
     concerned = set(callbacks)
-    for one in found:
-        if one.refused and concerned & one.callbacks:
-            raise InputError(f"{recording}: nothing can be planned from it, {one.note}")
+    for contradiction in contradictions:
+        if contradiction.refused and concerned & contradiction.callbacks:
+            raise InputError(f"{recording}: nothing can be planned from it, {contradiction.note}")
 
 
-def with_shown_periods(callbacks: pl.DataFrame, found: Iterable[Contradiction]) -> pl.DataFrame:
-    """The frame of callbacks, with the period that a timer's starts show as its ``period_ns``,
-    where that differs from the declared one."""
+def with_shown_periods(
+    callbacks: pl.DataFrame, contradictions: Iterable[Contradiction]
+) -> pl.DataFrame:
+    """Set ``period_ns`` of timers whose starts show another period than the declared one."""
     shown = {
         callback: contradiction.period_ns
-        for contradiction in found
+        for contradiction in contradictions
         for callback in contradiction.callbacks
         if contradiction.period_ns is not None
     }
@@ -101,25 +100,28 @@ def with_shown_periods(callbacks: pl.DataFrame, found: Iterable[Contradiction]) 
 
 
 def clock_text(time_ns: int) -> str:
-    """When something happened, as the trace's clock shows it: ``at 3600.101 s``."""
+    """Text for an instant of the trace's clock: ``at 3600.101000 s of the trace's clock``."""
     return f"at {time_ns / 1e9:.6f} s of the trace's clock"
 
 
 def _moved_clock(stamped: StampedMessages | None) -> Iterator[Contradiction]:
+    """The wall clock was moved while messages were recognised by its time alone."""
     if stamped is None or not stamped.moves:
         return
-    first, total = stamped.moves[0], sum(one.by_ns for one in stamped.moves)
-    said = f"by {first.by_ns / 1e6:+.3f} ms {clock_text(first.time_ns)}"
+    first, total = stamped.moves[0], sum(move.by_ns for move in stamped.moves)
+    moved = f"by {first.by_ns / 1e6:+.3f} ms {clock_text(first.time_ns)}"
     if len(stamped.moves) > 1:
-        said += f", and {len(stamped.moves) - 1} times more, by {total / 1e6:+.3f} ms in all"
-    count, untold = stamped.frame.height, stamped.frame["publication"].null_count()
-    left = f"all {count} could be followed, with the clock as it was then"
-    if untold:
-        left = f"of {untold} among {count} the publication is not certain, and they are left out"
+        moved += f", and {len(stamped.moves) - 1} times more, by {total / 1e6:+.3f} ms in all"
+    count, uncertain = stamped.frame.height, stamped.frame["publication"].null_count()
+    followed = f"all {count} could be followed, with the clock as it was then"
+    if uncertain:
+        followed = (
+            f"of {uncertain} among {count} the publication is not certain, and they are left out"
+        )
     yield Contradiction(
         frozenset(),
-        f"the wall clock was moved while this was recorded, {said}; before Jazzy messages are"
-        f" recognised by its time: {left}.",
+        f"the wall clock was moved while this was recorded, {moved}; before Jazzy messages are"
+        f" recognised by its time: {followed}.",
         refused=False,
     )
 
@@ -127,6 +129,7 @@ def _moved_clock(stamped: StampedMessages | None) -> Iterator[Contradiction]:
 def _before_their_publication(
     taken: pl.DataFrame, published: pl.DataFrame
 ) -> Iterator[Contradiction]:
+    """Messages were taken before they were published."""
     sent = published["time"].gather(taken["publication"])
     if not (early := taken.filter(taken["time"] < sent)).height:
         return
@@ -145,47 +148,55 @@ def _before_their_publication(
         )
 
 
-def _without_takes(one: UnseenTakes) -> Contradiction:
-    said = (
-        f"the callback of {one.node} for {one.topic} ran without any event of a take (instances:"
-        f" {one.runs}, the first {clock_text(one.first_ns)} in thread {one.tid}; loaned messages"
-        " have no such events, nor have Foxy and plain Galactic)"
+def _without_takes(subscription: UnseenTakes) -> Contradiction:
+    """A callback ran, but no event shows a take of its message."""
+    first = f"the first {clock_text(subscription.first_ns)} in thread {subscription.tid}"
+    problem = (
+        f"the callback of {subscription.node} for {subscription.topic} ran without any event of a"
+        f" take (instances: {subscription.runs}, {first}; loaned messages have no such events, nor"
+        " have Foxy and plain Galactic)"
     )
-    if one.linked:
-        said += f": of {one.linked} it is certain which publication they got, by their times"
-        if one.linked < one.runs:
-            said += ", the others are left out"
-        return Contradiction(frozenset({one.callback_id}), f"{said}.", refused=False)
-    why = f"{one.publishers} publishers write the topic"
-    if one.publishers == 1:
-        why = "publications and callbacks do not alternate"
-    elif not one.publishers:
-        why = "no publication of the topic was recorded"
+    if subscription.linked:
+        problem += (
+            f": of {subscription.linked} it is certain which publication they got, by their times"
+        )
+        if subscription.linked < subscription.runs:
+            problem += ", the others are left out"
+        return Contradiction(frozenset({subscription.callback_id}), f"{problem}.", refused=False)
+    reason = f"{subscription.publishers} publishers write the topic"
+    if subscription.publishers == 1:
+        reason = "publications and callbacks do not alternate"
+    elif not subscription.publishers:
+        reason = "no publication of the topic was recorded"
     return Contradiction(
-        frozenset({one.callback_id}),
-        f"{said}: which message it got cannot be known, since {why}. Record without loaned messages"
-        " (ROS_DISABLE_LOANED_MESSAGES=1), or on a distribution that traces takes.",
+        frozenset({subscription.callback_id}),
+        f"{problem}: which message it got cannot be known, since {reason}. Record without loaned"
+        " messages (ROS_DISABLE_LOANED_MESSAGES=1), or on a distribution that traces takes.",
         refused=True,
     )
 
 
-def _of_another_period(one: OtherPeriod) -> Contradiction:
-    declared = duration_text(one.declared_ns)
-    said = f"the timer of {one.node} was created with a period of {declared}, but its callback"
-    when = f" ({one.starts} starts, the first {clock_text(one.first_ns)})"
-    if one.period_ns is not None:
-        shown = duration_text(one.period_ns)
-        note = f"{said} starts every {shown}{when}: {shown} counts as its period."
-        return Contradiction(frozenset({one.callback_id}), note, False, one.period_ns)
-    usual = duration_text(round(one.usual_ns, -3))
-    note = (
-        f"{said} starts more often, mostly {usual} apart but not regularly{when}: its period is not"
-        " known; record it while the period stays the same."
+def _of_another_period(timer: ShownPeriod) -> Contradiction:
+    """A timer's callback starts at another period than declared."""
+    declared = duration_text(timer.declared_ns)
+    declared_only = (
+        f"the timer of {timer.node} was created with a period of {declared}, but its callback"
     )
-    return Contradiction(frozenset({one.callback_id}), note, refused=True)
+    when = f" ({timer.starts} starts, the first {clock_text(timer.first_ns)})"
+    if timer.period_ns is not None:
+        shown = duration_text(timer.period_ns)
+        note = f"{declared_only} starts every {shown}{when}: {shown} counts as its period."
+        return Contradiction(frozenset({timer.callback_id}), note, False, timer.period_ns)
+    usual = duration_text(round(timer.usual_ns, -3))
+    note = (
+        f"{declared_only} starts more often, mostly {usual} apart but not regularly{when}: its"
+        " period is not known; record it while the period stays the same."
+    )
+    return Contradiction(frozenset({timer.callback_id}), note, refused=True)
 
 
 def _longer_than_they_ran(nodes: pl.DataFrame, ends: LostEnds) -> Iterator[Contradiction]:
+    """Callbacks span their executor's next take, or its search for work."""
     lost = "their ends and the starts after them were lost, so they have no end"
     if ends.complete:
         doubt = "it spins an executor itself now and then, or losses were not counted; they count"
@@ -197,56 +208,65 @@ def _longer_than_they_ran(nodes: pl.DataFrame, ends: LostEnds) -> Iterator[Contr
         (ends.by_take, "took the next message for it, or executed it again", lost, False),
         (ends.by_wait, "looked for other work, or did some", doubt, not ends.complete),
     )
-    for numbers, proof, said, refused in proofs:
+    for numbers, proof, consequence, refused in proofs:
         rows = ends.instances.filter(pl.col("instance").is_in(numbers.implode()))
         for number, about, where in _by_callback(rows, nodes):
-            note = f"{about} seems to last on although its thread {proof} ({where}): {said}."
+            note = f"{about} seems to last on although its thread {proof} ({where}): {consequence}."
             yield Contradiction(frozenset({number}), note, refused)
 
 
 def _inside_themselves(
     tables: events.EventTables, nodes: pl.DataFrame, ends: LostEnds
 ) -> Iterator[Contradiction]:
-    """Instances without an end in which the same callback ran on the same thread, as an end of it
-    that belongs to no other start tells."""
+    """Callbacks ran inside themselves in one thread.
+
+    An instance has no end, the same callback starts again on the thread, and there is an event of
+    an end that belongs to no other start.
+    """
     thread, key = ["pid", "tid"], ["pid", "tid", "callback_id"]
     instances = ends.instances
     if not instances["end"].null_count():
         return
-    open_ones = instances.filter(pl.col("end").is_null() & ~pl.col("assumed"))
-    numbers = open_ones["callback_id"].unique().implode()
+    unended = instances.filter(pl.col("end").is_null() & ~pl.col("assumed"))
+    numbers = unended["callback_id"].unique().implode()
     following = instances.filter(pl.col("callback_id").is_in(numbers)).select(*key, after="start")
-    rows = first_after(open_ones, following, key, "start", "after", strictly=True)
+    rows = first_after(unended, following, key, "start", "after", strictly=True)
     rows = rows.drop_nulls("after")
     if rows.is_empty():
         return
     handles = nodes.select("callback_id", callback="handle")
     closed = instances.select(*thread, "callback_id", time="end").drop_nulls("time")
     closed = closed.join(handles, on="callback_id").select(*thread, "callback", "time")
-    spare = events.table(tables, "callback_end").select("time", *thread, "callback")
-    spare = spare.join(closed, on=[*thread, "callback", "time"], how="anti", maintain_order="left")
+    unmatched = events.table(tables, "callback_end").select("time", *thread, "callback")
+    unmatched = unmatched.join(
+        closed, on=[*thread, "callback", "time"], how="anti", maintain_order="left"
+    )
     opened = rows.join(handles, on="callback_id", maintain_order="left")
     opened = opened.select(*thread, "callback", "instance", "after", opened="start")
-    hit = latest_before(spare, opened, [*thread, "callback"], "time", "opened")
-    hit = hit.filter(pl.col("time") > pl.col("after"))
-    rows = instances.filter(pl.col("instance").is_in(hit["instance"].drop_nulls().implode()))
+    ended_inside = latest_before(unmatched, opened, [*thread, "callback"], "time", "opened")
+    ended_inside = ended_inside.filter(pl.col("time") > pl.col("after"))
+    rows = instances.filter(
+        pl.col("instance").is_in(ended_inside["instance"].drop_nulls().implode())
+    )
     for number, about, where in _by_callback(rows, nodes):
-        said = "how long the outer ones took cannot be known"
+        consequence = "how long the outer ones took cannot be known"
         if not ends.complete:
-            said += "; or the end of each, and the start of a later one, were lost"
-        note = f"{about} ran inside itself in one thread ({where}): {said}."
+            consequence += "; or the end of each, and the start of a later one, were lost"
+        note = f"{about} ran inside itself in one thread ({where}): {consequence}."
         yield Contradiction(frozenset({number}), note, refused=ends.complete)
 
 
 def _by_callback(rows: pl.DataFrame, nodes: pl.DataFrame) -> Iterator[tuple[int, str, str]]:
-    """Callback, what it is in words, and how many rows of it there are, and where the first one
-    is; not of what every node has for itself."""
+    """Count the rows of each callback; callbacks that every node has are left out.
+
+    Yield the callback's id, its name in words, and how many rows there are and when the first was.
+    """
     about = nodes.select("callback_id", "node", "kind", "topic", "period_ns", "declared_ns")
-    for (number,), own in rows.sort("start").group_by("callback_id", maintain_order=True):
+    for (number,), of_callback in rows.sort("start").group_by("callback_id", maintain_order=True):
         _, node, kind, topic, period, declared = about.filter(callback_id=number).row(0)
         if topic in INTERNAL_TOPICS:
             continue
         trigger = trigger_text(topic and f"for {topic}", period, declared)
-        first, tid = own.select("start", "tid").row(0)
-        where = f"instances: {own.height}, the first {clock_text(first)} in thread {tid}"
+        first, tid = of_callback.select("start", "tid").row(0)
+        where = f"instances: {of_callback.height}, the first {clock_text(first)} in thread {tid}"
         yield int(str(number)), f"the {kind} callback of {node} {trigger}", where

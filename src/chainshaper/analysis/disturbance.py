@@ -1,24 +1,25 @@
 """When each output was due, which came late, and which traversals the machine itself disturbed.
 
-Where a gate decided, its row (`gate_release`) says from which instant the slots count, and what
+Where a gate decided, its row of `gate_release` says from which instant the slots count, and what
 became of an output that overran. Where no gate decided, an output is due in the cycle that the
-plan says, and without a plan within a period of the chain's start. With the anchor `cycle` a gate
-takes an output for one of the cycle that it arrives in; the traversal knows better: a chain that
-began in an earlier cycle is late by whole cycles.
+plan says, and without a plan within a period of the chain's start. A gate with the anchor `cycle`
+counts an output to the cycle that it arrives in; the traversal knows better: a chain that began in
+an earlier cycle is late by whole cycles.
 
-A sleeper at the highest priority sees the machine stop: a row of `machine_stall` says that on core
-``cpu`` no thread ran from ``time`` for ``duration``. A cycle is disturbed by stalls **before the
-moment at which its output was due**, and by no other:
+A sleeper at the highest priority sees when the machine stops: a row of `machine_stall` says that on
+core ``cpu`` no thread ran from ``time`` for ``duration``. Only stalls **before the moment at which
+its output was due** disturb a cycle:
 
-* **At two instants** any stall disturbs what a gate lets go: where the origin is taken (between the
+* **At two instants** any stall disturbs an output of a gate: where the origin is taken (between the
   traversal's start and the anchor's origin), and around the moment at which the output was due.
-* **In between** stalls add up, on one core, within [start, due]. Without a gate they disturb from
-  ``COMPUTING_THRESHOLD_NS`` in all; a gate absorbs what the plan's margin ε has room for. Without
-  a gate a cycle is looked at from when the timer that starts it was due: a stall that ends just
-  before a late callback begins has made it late, and what piled up meanwhile runs beside it.
+* **In between**, within [start, due], the stalls of a core add up. Without a gate they disturb if
+  they take ``COMPUTING_THRESHOLD_NS`` or more in all; with a gate, if they take more than the
+  plan's margin ε. Without a gate the window begins when the timer that starts the cycle was due: a
+  stall that ends just before a late callback begins has made it late, and whatever piled up
+  meanwhile runs beside it.
 * A traversal that began before its disturbed predecessor was computed may have queued behind it,
-  and counts as disturbed with it, unless the plan has them overlap (logical execution time,
-  pipelines), or they overlap anyhow, in a chain that mostly takes longer than its period.
+  and counts as disturbed as well. Not so where traversals overlap as the plan says (logical
+  execution time, pipelines), or always, in a chain that mostly takes longer than its period.
 """
 
 from collections.abc import Mapping
@@ -35,8 +36,7 @@ from chainshaper.robot.shaper import STALL_NS
 from chainshaper.values import events
 from chainshaper.values.application import Chain
 
-WAKE_UP_NS = 250_000
-
+WAKE_UP_NS = 250_000  # from the start of a cycle to that of its first callback
 WAKING_NS = 200_000  # a gate wakes up and publishes within this time of a release
 COMPUTING_THRESHOLD_NS = 1_000_000  # less hardly changes a chain that computes for tens of ms
 
@@ -46,46 +46,43 @@ Mask = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Due:
-    """When a plan has the outputs of a chain, those on a topic, leave (ns).
-
-    ``output`` None: the plan is for any chain. An output leaves in one of ``slots``, ``cycles``
-    cycles after the one in which its chain began; with ``slots`` empty at any time of that cycle.
-    ``last_slot`` is the place of the last slot that is open to a mode, where the plan has modes.
-    ``from_cycle``: slots count from the start of the cycle, else from the chain's own start.
-    ``margin_ns`` is ε, what a gate absorbs in every cycle.
-    """
+    """When, by a plan, the outputs of a chain leave. Times are in ns."""
 
     cycle_ns: int
-    cycles: int = 0
-    slots: tuple[tuple[int, int], ...] = ()
-    last_slot: Mapping[str, int] = field(default_factory=dict)
-    from_cycle: bool = False
-    margin_ns: int = 0
-    output: str | None = None
+    cycles: int = 0  # how many cycles after the one in which the chain began
+    slots: tuple[tuple[int, int], ...] = ()  # in one of these of that cycle; (): at any time of it
+    last_slot: Mapping[str, int] = field(default_factory=dict)  # mode → place of its last slot
+    from_cycle: bool = False  # slots count from the cycle's start, else from the chain's own start
+    margin_ns: int = 0  # ε, what a gate absorbs in every cycle
+    output: str | None = None  # the topic; None: the plan is for any chain
 
 
 def with_punctuality(
     flow: DataFlow, traversals: Traversals, due: Due | None
 ) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """The frame of traversals with more columns, and all decisions of gates about them.
+    """Add to the frame of traversals when outputs were due; also return all decisions of gates.
 
-    * ``place_ns``: where the output left, from the instant that the slots count from.
-    * ``due_at``: when it should have left; of several slots the one it was let go in. Where no gate
-      decided it is when it left, or the end of the cycle that it was due in, if that came first.
-    * ``late``: whether it left behind the last slot it was due in, or the cycle (null: nothing says
-      when it was due).
-    * ``origin``: from when the gate counted (null: no gate decided); ``computed_at``: when the
-      chain was done, at the gate's door or with the publication; ``expected_at``: when the timer
-      that starts the chain was due (:func:`timer_due`), or else the start.
+    Columns that are added, in ns:
 
-    The decisions are those of :func:`~chainshaper.analysis.messages.gated_hops`.
+    * ``place_ns``: when the output left, counted from the instant that the slots count from.
+    * ``due_at``: when it should have left; of several slots, in the one in which the gate let it
+      go. Where no gate decided: when it left, or the end of the cycle in which it was due, if that
+      came first.
+    * ``late``: whether it left behind the last slot, or the cycle, in which it was due (null: when
+      it was due is not known).
+    * ``origin``: the instant from which the gate counted (null: no gate decided).
+    * ``computed_at``: when the chain had computed: the arrival at the gate, or the publication.
+    * ``expected_at``: when the timer that starts the chain was due (:func:`timer_due`), or else the
+      start.
+
+    The decisions are the frame of :func:`~chainshaper.analysis.messages.gated_hops`.
     """
     hops, chain = traversals.hops, traversals.chain
     releases = gated_hops(flow.events, flow.objects, hops, 0 if due is None else due.cycles)
     decided = releases.filter(pl.col("hop") == len(chain.callbacks) - 1).drop("hop")
-    # A standby publishes at once what went around the gate: no slot was chosen for it.
+    # A message that went around the gate is published at once by the standby: it has no slot.
     decided = decided.filter(pl.col("overrun").ne_missing("bypass"))
-    if decided.is_empty():  # nulls as the join would give them, which take no memory like this
+    if decided.is_empty():  # the nulls that the join would give, but as literals, without memory
         columns = decided.drop("traversal").schema.items()
         frame = traversals.frame.with_columns(pl.lit(None, kind).alias(n) for n, kind in columns)
     else:
@@ -101,7 +98,7 @@ def with_punctuality(
     origin = counted_from - _cycles_behind(cycle_ns)
     opens, closes = _last_slot(frame, due)
     place = end - pl.when(gated).then(origin).otherwise(began)
-    # Under LET per callback, the gates before the last have each kept the message for a cycle.
+    # Under LET per callback, each of the gates before the last has delayed the message by a cycle.
     behind = counted_from - origin > (0 if due is None else due.cycles) * pl.lit(cycle_ns or 0)
     overran = pl.col("overrun").is_not_null() | behind
     late = pl.when(gated).then(overran | (place >= closes).fill_null(False))
@@ -119,12 +116,15 @@ def with_punctuality(
 
 
 def _expected(flow: DataFlow, traversals: Traversals, period_ns: int | None) -> pl.Expr:
-    """When the timer of each traversal's first callback was due; without a timer its start."""
+    """When the timer that starts each traversal was due (ns); without a timer its start."""
     if period_ns is None:
         return pl.col("start")
     first = flow.instances.filter(pl.col("callback_id") == traversals.chain.callbacks[0])
     processes = first.sort("start").partition_by("pid")  # each has its own timer
-    due = [own.select("start", expected=timer_due(own["start"], period_ns)) for own in processes]
+    due = [
+        of_process.select("start", expected=timer_due(of_process["start"], period_ns))
+        for of_process in processes
+    ]
     if not due:
         return pl.col("start")
     known = pl.concat(due)
@@ -136,12 +136,13 @@ def _expected(flow: DataFlow, traversals: Traversals, period_ns: int | None) -> 
 
 
 def timer_due(starts: pl.Series, period_ns: int) -> pl.Series:
-    """When a timer was due for each start of its callback, in order: at the latest at the start.
+    """Find when a timer was due for each start of its callback (ns), at the latest at the start.
 
-    A timer keeps its phase, and one that missed several expiries fires once: it was due at the
-    first expiry behind the start before. Where starts show no phase (a clock of a simulation, a
-    timer that was reset), it was due a period behind the start before. One that mostly starts less
-    often than its period says is not late each time: it has the period that it shows.
+    ``starts`` are in order. A timer keeps its phase, and one that missed several expiries fires
+    once: it was due at the first expiry after the start before. Where starts show no phase (the
+    clock of a simulation, a timer that was reset), it was due a period after the start before. A
+    timer that mostly starts less often than its period says is not late each time: the median
+    distance of its starts counts as its period.
     """
     usual: float = starts.diff().median() or 0.0  # type: ignore[assignment]
     if usual > 1.5 * period_ns:
@@ -156,9 +157,10 @@ def timer_due(starts: pl.Series, period_ns: int) -> pl.Series:
 
 
 def due_within(flow: DataFlow, chain: Chain, due: Due | None) -> int | None:
-    """How long after its beginning an output is late whatever the slots are (ns; None: not known).
+    """How long after its chain began an output is late at any rate (ns; None: not known).
 
-    The period of the timer that starts the chain stands for the cycle of a plan.
+    That is at the end of the cycle in which it is due. Without a plan the period of the timer that
+    starts the chain is the cycle.
     """
     return timer_period(flow, chain) if due is None else (due.cycles + 1) * due.cycle_ns
 
@@ -170,10 +172,10 @@ def timer_period(flow: DataFlow, chain: Chain) -> int | None:
 
 
 def lateness_in_cycle(starts: pl.Series, cycle_ns: int) -> pl.Series:
-    """How long after the start of the cycle each chain began (ns).
+    """How long after the start of its cycle each chain began (ns).
 
-    When cycles started is not recorded. The beginning behind the widest part of the cycle that has
-    none stands for it, which came a wake-up after the start.
+    No event shows when cycles start. So the chains' places in the cycle are looked at: the one that
+    follows the widest gap between them is the earliest, and came a wake-up after the start.
     """
     places = (starts % cycle_ns).sort()
     if not len(places):
@@ -185,8 +187,10 @@ def lateness_in_cycle(starts: pl.Series, cycle_ns: int) -> pl.Series:
 
 
 def _cycles_behind(cycle_ns: int | None) -> pl.Expr:
-    """How long before the gate's cycle the one began in which the chain did: whole cycles (ns).
-    A chain may begin a little before its cycle does, by a tenth of it at most."""
+    """How long before the gate's cycle the chain's own cycle began: whole cycles (ns).
+
+    A chain may begin a little before its cycle does, by a tenth of the cycle at most.
+    """
     if cycle_ns is None:
         return pl.lit(0, dtype=pl.Int64)
     before = pl.col("origin") - pl.col("start") - cycle_ns // 10
@@ -195,8 +199,10 @@ def _cycles_behind(cycle_ns: int | None) -> pl.Expr:
 
 
 def _last_slot(frame: pl.DataFrame, due: Due | None) -> tuple[pl.Expr, pl.Expr]:
-    """Start and end of the last slot that is open to each output, from the slots' origin on, where
-    it was moved to. Without a plan the latest place at which one in time was let go stands for it.
+    """Start and end of the last slot that is open to each output, counted from the slots' origin.
+
+    A shift of the slots (``moved_ns``) is part of it. Without a plan the slot starts where the last
+    output that was in time was let go, and has no end.
     """
     if due is None or not due.slots:
         in_time = frame.filter(pl.col("overrun").is_null() & (pl.col("cycles_waited") == 0))
@@ -206,13 +212,13 @@ def _last_slot(frame: pl.DataFrame, due: Due | None) -> tuple[pl.Expr, pl.Expr]:
     for mode, slot in due.last_slot.items():
         last = pl.when(pl.col("mode") == mode).then(slot).otherwise(last)
     delay = due.cycles * due.cycle_ns
-    sides = (pl.Series([s + delay for s in side]) for side in zip(*due.slots, strict=True))
+    sides = (pl.Series([time + delay for time in side]) for side in zip(*due.slots, strict=True))
     opens, closes = (pl.lit(side).gather(last) + pl.col("moved_ns") for side in sides)
     return opens, closes
 
 
 def disturbed(flow: DataFlow, frame: pl.DataFrame, margin_ns: int = 0) -> Mask:
-    """A mask over the rows of ``frame``; incomplete traversals are never marked.
+    """Mark the traversals that stalls disturbed; incomplete ones are never marked.
 
     ``frame`` is that of :func:`with_punctuality`, ``margin_ns`` the margin of the plan in force.
     """
@@ -229,7 +235,7 @@ def disturbed(flow: DataFlow, frame: pl.DataFrame, margin_ns: int = 0) -> Mask:
     lost = stalled_within(np.where(gated, start, expected), due, began, ended, core)
     most = np.where(gated, max(COMPUTING_THRESHOLD_NS, margin_ns + 1), COMPUTING_THRESHOLD_NS)
     hit = complete & ((gated & at_instants) | (lost >= most))
-    # A predecessor that was to be out later than the next began is not waited for.
+    # A traversal does not wait for a predecessor whose output was due after it began.
     following = np.append(start[1:], np.iinfo(np.int64).max)[: len(start)]
     overlapped = (computed[:-1] > start[1:])[~hit[:-1]]
     anyhow = 2 * np.count_nonzero(overlapped) > len(overlapped)
@@ -238,13 +244,13 @@ def disturbed(flow: DataFlow, frame: pl.DataFrame, margin_ns: int = 0) -> Mask:
 
 
 def stalled_after(flow: DataFlow, start: Times, end: Times) -> Mask:
-    """Which windows [start, end] any stall meets: a delivery that the machine disturbed."""
+    """Mark the windows [start, end], those of deliveries, that any stall meets."""
     began, ended, _ = _stalls(flow)
     return overlapping(start, end, began, ended)
 
 
 def _stalls(flow: DataFlow) -> tuple[Times, Times, Times]:
-    """Stalls of STALL_NS or more: when they began and ended, and their cores (−1: not known)."""
+    """List stalls of STALL_NS or more: when each began and ended (ns), its core (−1: not known)."""
     table = events.table(flow.events, "machine_stall", ["cpu"])
     table = table.filter(pl.col("duration") >= STALL_NS)
     core = table["cpu"].fill_null(-1).cast(pl.Int64).to_numpy()
@@ -252,7 +258,11 @@ def _stalls(flow: DataFlow) -> tuple[Times, Times, Times]:
 
 
 def _queued_behind(hit: Mask, start: Times, busy_until: Times, may_queue: Mask) -> Mask:
-    """Traversals, in order of start, linked to a disturbed one by predecessors still computed."""
+    """Mark traversals that may have queued behind a disturbed one.
+
+    ``start`` is in order. A traversal may queue if a predecessor was computed until after it began;
+    it did so behind a disturbed one if an unbroken row of such links leads back to that.
+    """
     linked = np.zeros(len(start), dtype=np.bool_)
     linked[1:] = may_queue[1:] & (start[1:] < np.maximum.accumulate(busy_until)[:-1])
     position = np.arange(len(start))
@@ -262,16 +272,16 @@ def _queued_behind(hit: Mask, start: Times, busy_until: Times, may_queue: Mask) 
 
 
 def stalled_within(start: Times, end: Times, began: Times, ended: Times, core: Times) -> Times:
-    """Per window [start, end] the time lost in it to stalls of one core, the worst one (ns).
+    """How much time each window [start, end] lost to stalls of a core; the worst core counts (ns).
 
-    A gate and a meter may both have seen a stall: of those that overlap, each ns counts once. What
-    stalls took up to an instant is then linear between their beginnings and ends, and a window's
-    share is a difference of two.
+    A gate and a meter may both have seen one stall: where stalls overlap, each ns counts once. The
+    time lost in a window is the difference of two sums: what stalls took until its end, and until
+    its start.
     """
     worst = np.zeros(len(start), dtype=np.int64)
-    for one in np.unique(core):
-        order = np.argsort(began[core == one], kind="stable")
-        first, last = began[core == one][order], ended[core == one][order]
+    for single_core in np.unique(core):
+        order = np.argsort(began[core == single_core], kind="stable")
+        first, last = began[core == single_core][order], ended[core == single_core][order]
         last = np.maximum.accumulate(last)
         first[1:] = np.maximum(first[1:], last[:-1])
         total = np.concatenate(([0], np.cumsum(last - first)))
@@ -286,9 +296,9 @@ def stalled_within(start: Times, end: Times, began: Times, ended: Times, core: T
 
 
 def overlapping(start: Times, end: Times, began: Times, ended: Times) -> Mask:
-    """Whether each closed window [start, end] meets any of the intervals [began, ended).
+    """Mark the closed windows [start, end] that meet any of the intervals [began, ended).
 
-    Of all intervals those that begin in time for the window, minus those that are over before it.
+    How many meet it: the intervals that begin before its end, less those that end before its start.
     """
     begun_by_end = np.searchsorted(np.sort(began), end, side="right")
     over_by_start = np.searchsorted(np.sort(ended), start, side="right")

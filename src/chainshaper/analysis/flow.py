@@ -1,20 +1,20 @@
 """From events to the data flow: callback instances, the messages they took, those they published.
 
-This is the step that everything about chains builds on: it joins objects, callback instances,
-publications and takes into four frames that refer to each other by number. It costs a fixed
-number of sorts and joins, however many events there are.
+Everything about chains builds on this step. It joins objects, callback instances, publications and
+takes into frames that refer to each other by row number. It costs a fixed number of sorts and
+joins, however many events there are.
 
 An instance runs from `callback_start` to `callback_end` of the same callback on the same thread
-(paper, section 2.4). Some work has no callback event, but its messages prove it. Such instances
-are assumed (``assumed``, no ``end``, no response time):
+(paper, section 2.4). Some callbacks have no such events, but their messages prove that they ran.
+For these, instances are assumed (column ``assumed``; they have no ``end`` and no response time):
 
 * A Python node (rclpy), or one that takes from a wait set, has no callback events. An instance of
-  its subscription begins with each take, one of its timer with each `rcl_timer_call`. What its
-  thread publishes for the same node until the next of these counts as that instance's output.
+  its subscription begins with each take, one of its timer with each `rcl_timer_call`. What the
+  thread publishes for the same node until the next such beginning is that instance's output.
 * The callback of a service's client, and what an action's client and server do, begin with the
-  take as well. They end when the thread's executor looks for work again, where events tell that
-  (then they are not ``assumed``).
-* A driver's own thread, a player of recorded data or a Python timer without such events publishes
+  take as well. They end when the thread's executor looks for work again. Where an event shows
+  that, they have an end, and are not ``assumed``.
+* A driver's thread, a player of recorded data, or a Python timer without `rcl_timer_call` publishes
   outside all callbacks that events show. A topic that its node publishes only like this gets a
   callback of kind ``unknown``, with the handle 0 and one instance per publication.
 """
@@ -49,32 +49,43 @@ from chainshaper.values.recording import Recording
 
 _ACTION = "/_action/"
 _SPENT = ("callback_start", "callback_end", "rmw_publish", "rmw_take")
-"""The largest tables; the data flow has what hardly anybody looks up in them later."""
+"""The largest tables. What the analysis needs of them is in the data flow."""
 MANY_ROWS = 1_000_000
-"""Tables that are larger are not kept beside the data flow: tens of MB each."""
+"""Tables with more rows (tens of MB each) leave memory once the data flow is there."""
 
 
 @dataclass(frozen=True)
 class DataFlow:
-    """A recording, resolved.
+    """The data flow of a recording: who exists, what ran when, which message went where.
 
-    * ``objects``: who exists, see :class:`~chainshaper.analysis.objects.Objects`; periods of timers
-      are those that their starts show.
-    * ``instances``: see :func:`callback_instances`, with those that no event shows added, and
-      without the ends that other events disprove (:mod:`~chainshaper.analysis.lost_ends`: then,
-      and where an end was lost, ``until`` is when it had ended at the latest, null if not known).
-      An instance's number is its row.
-    * ``publications``: see :func:`~chainshaper.analysis.messages.publications`, with the
-      ``instance`` in which each was published and its ``callback_id`` (null: outside callbacks),
-      and when it was ``sent`` (null: it never was).
-    * ``takes``: see :func:`~chainshaper.analysis.messages.takes`, with the ``publication`` that
-      was read and the ``instance`` that got the message (null: none did).
-    * ``events``: the tables all this came from.
-    * ``notes``: what cannot be known, in plain words.
-    * ``contradictions``: what in the events contradicts itself; their notes are in ``notes``.
-    * ``untold``: subscriptions' callbacks that ran without any event of a take.
-    * ``followed``: see :func:`~chainshaper.analysis.restarts.followed_processes`. Callbacks of a
-      node that was started again have one ``callback_id`` in all frames.
+    ``objects``
+        Nodes, callbacks and endpoints (:class:`~chainshaper.analysis.objects.Objects`). A timer's
+        period is the one that its starts show.
+    ``instances``
+        The frame of :func:`callback_instances`, and the assumed instances. A row's place is the
+        instance's number. Ends that other events disprove are left out
+        (:mod:`~chainshaper.analysis.lost_ends`). One column is added:
+        ``until``, when an instance without an end had ended at the latest (ns, null: not known).
+    ``publications``
+        The frame of :func:`~chainshaper.analysis.messages.publications`, and three columns:
+        ``instance`` in which it was published (null: outside callbacks);
+        ``callback_id`` of that instance;
+        ``sent``, when it left the process (ns, null: it never did).
+    ``takes``
+        The frame of :func:`~chainshaper.analysis.messages.takes`, and two columns:
+        ``publication`` that was taken (null: not known);
+        ``instance`` that got the message (null: none did).
+    ``events``
+        The tables that all this came from.
+    ``notes``
+        What cannot be known, in plain words, with the notes of the contradictions.
+    ``contradictions``
+        Events that contradict each other.
+    ``without_takes``
+        Ids of subscriptions' callbacks that ran although no event shows a take of theirs.
+    ``followed``
+        The frame of :func:`~chainshaper.analysis.restarts.followed_processes`. The callbacks of a
+        node that was started again have one ``callback_id`` in all frames.
     """
 
     objects: Objects
@@ -84,12 +95,12 @@ class DataFlow:
     events: events.EventTables
     notes: tuple[str, ...]
     contradictions: tuple[Contradiction, ...] = ()
-    untold: frozenset[int] = frozenset()
+    without_takes: frozenset[int] = frozenset()
     followed: pl.DataFrame = field(default_factory=FOLLOWED.to_frame)
 
 
 def recorded_flow(recording: Recording) -> DataFlow:
-    """Resolve a recording's events, with what it knows of the clocks and of lost events."""
+    """Resolve the events of a recording, with its clock offset and its count of lost events."""
     info = recording.info
     flow = data_flow(recording.events, info.clock_offset_ns, complete=not any(info.lost.values()))
     if isinstance(recording.events, events.ReadAgain):
@@ -98,7 +109,7 @@ def recorded_flow(recording: Recording) -> DataFlow:
 
 
 def _many_rows(tables: events.EventTables, name: str) -> bool:
-    """Whether a table takes more memory than reading it again takes time."""
+    """Whether a table is so large that reading it again, if need be, is the better bargain."""
     return events.table(tables, name).height > MANY_ROWS
 
 
@@ -110,12 +121,12 @@ def data_flow(
     ended: Collection[int] | None = None,
     complete: bool = False,
 ) -> DataFlow:
-    """Resolve a recording's events.
+    """Resolve the events of some tables.
 
-    ``clock_offset_ns``, to add to event times for CLOCK_REALTIME, matters only before Jazzy.
-    ``objects`` are the tables' own, where they have been resolved already. ``ended`` are the
-    processes that have ended, where that is known better than from events. ``complete``: it is
-    known that no event was lost.
+    * ``clock_offset_ns``: CLOCK_REALTIME less the clock of events; matters only before Jazzy.
+    * ``objects``: those of the tables, if the caller has resolved them already.
+    * ``ended``: the processes that have ended; None: events decide.
+    * ``complete``: whether it is certain that no event was lost.
     """
     objects = objects or resolve_objects(tables)
     with ThreadPoolExecutor(max_workers=1) as beside:  # instances and messages meet only below
@@ -147,11 +158,23 @@ def data_flow(
         unseen=unseen,
         stamped=stamped,
     )
-    notes = (*objects.notes, *_notes(tables, instances, taken), *(one.note for one in seen))
-    untold = frozenset(one.callback_id for one in unseen)
+    notes = (
+        *objects.notes,
+        *_notes(tables, instances, taken),
+        *(contradiction.note for contradiction in seen),
+    )
+    without_takes = frozenset(subscription.callback_id for subscription in unseen)
     followed = followed_processes(tables, objects, ended)
     flow = DataFlow(
-        objects, instances, published, taken, tables, notes, seen, untold, followed=followed
+        objects=objects,
+        instances=instances,
+        publications=published,
+        takes=taken,
+        events=tables,
+        notes=notes,
+        contradictions=seen,
+        without_takes=without_takes,
+        followed=followed,
     )
     flow = _with_restarts(flow)  # which knows a timer again by its declared period
     shown = with_shown_periods(flow.objects.callbacks, flow.contradictions)
@@ -187,32 +210,40 @@ def _notes(
 
 
 def left_when_taken(flow: DataFlow, topics: Collection[str | None]) -> DataFlow:
-    """The flow in which messages on ``topics`` left when their first reader took them.
+    """The flow in which each message on ``topics`` left when its first reader took it.
 
-    For what a publisher's thread sends in ROS 2, of which events show only when it was handed over.
+    It is for topics that the publisher's thread of ROS 2 sends: events show only when a message was
+    handed to that thread. A flow with events of the sending itself stays as it is.
     """
     taken = flow.takes.drop_nulls("publication").sort("time", descending=True)
-    left = by_number(taken, "publication", "time", flow.publications.height)  # the last laid out
-    own = flow.publications.filter(left.is_not_null() & pl.col("topic").is_in([*topics]))["topic"]
-    if events.table(flow.events, "asynchronous_send").height or not own.len():
+    left = by_number(taken, "publication", "time", flow.publications.height)  # the first take
+    topics_left_late = flow.publications.filter(
+        left.is_not_null() & pl.col("topic").is_in([*topics])
+    )["topic"]
+    if events.table(flow.events, "asynchronous_send").height or not topics_left_late.len():
         return flow
-    sent = pl.when(pl.col("topic").is_in(own.implode())).then(left).otherwise("sent")
+    sent = pl.when(pl.col("topic").is_in(topics_left_late.implode())).then(left).otherwise("sent")
     note = "when it left no event says: it counts as published when its first reader took it"
-    notes = (*flow.notes, f"a thread of its own publishes {', '.join(own.unique())}: {note}")
+    notes = (
+        *flow.notes,
+        f"a thread of its own publishes {', '.join(topics_left_late.unique())}: {note}",
+    )
     return replace(flow, publications=flow.publications.with_columns(sent=sent), notes=notes)
 
 
 def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFrame:
-    """All instances of all callbacks, one row each, sorted by start.
+    """Make a frame of all instances of all callbacks, sorted by start.
 
-    ``callbacks`` is the frame of :class:`~chainshaper.analysis.objects.Objects`. The result has
+    ``callbacks`` is the frame of :class:`~chainshaper.analysis.objects.Objects`. Columns:
 
-    * ``instance``: numbered from 0 in order of start; ``callback_id``; ``pid``, ``tid``;
-    * ``start``, ``end``: ns of the event clock; ``end`` is null when it was lost, or the instance
-      was still running (:func:`~chainshaper.analysis.matching.ends_of_starts`);
-    * ``execution_ns``: CPU time (paper: e), from the ``thread_time`` columns where the source
-      has them, else from `sched_switch` (:func:`cpu_time`), else null;
-    * ``intra_process``: whether its message came through a ring buffer;
+    * ``instance``: numbered from 0 in order of start.
+    * ``callback_id``, ``pid``, ``tid``.
+    * ``start``: ns of the event clock.
+    * ``end``: ns of the event clock; null when the event was lost, or the instance was still
+      running (:func:`~chainshaper.analysis.matching.ends_of_starts`).
+    * ``execution_ns``: CPU time (paper: e), from the ``thread_time`` columns where the source has
+      them, else from `sched_switch` (:func:`cpu_time`), else null.
+    * ``intra_process``: whether its message came through a ring buffer.
     * ``assumed``: always false here.
     """
     starts = events.table(tables, "callback_start", ["is_intra_process"])
@@ -243,11 +274,12 @@ def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> p
 
 
 def cpu_time(tables: events.EventTables, spans: pl.DataFrame) -> pl.Series:
-    """CPU time of thread ``tid`` between ``start`` and ``end`` of every row, from `sched_switch`.
+    """CPU time (ns) of thread ``tid`` between ``start`` and ``end`` of each row of ``spans``.
 
-    Exact: what the thread had accumulated at its last switch plus, if that switched it in, the time
-    since. A thread whose first switch takes it off its core is taken to have run since the
-    recording began. Null without an end, and for threads that never appear in `sched_switch`.
+    From `sched_switch`, and exact: the time the thread had used at its last switch plus, if that
+    switched it in, the time since. A thread whose first switch takes it off its core counts as
+    running since the recording began. Null without an end, and for threads that never appear in
+    `sched_switch`.
     """
     curve = _running_time(tables)
     rows = spans.select("tid", "start", "end").with_row_index("row")
@@ -260,10 +292,11 @@ def cpu_time(tables: events.EventTables, spans: pl.DataFrame) -> pl.Series:
 
 
 def _plausible(frame: pl.DataFrame) -> pl.DataFrame:
-    """``execution_ns`` without what cannot be: a callback that ran used its core.
+    """The frame without values of ``execution_ns`` that cannot be: who runs uses CPU time.
 
     Where most instances of a thread used none, `sched_switch` speaks of another thread with the
-    same number (the trace was taken inside a container); where single ones did, switches were lost.
+    same number (the trace was taken inside a container): all its values go. Where few used none,
+    switches were lost: only these go.
     """
     used, thread = pl.col("execution_ns"), ["pid", "tid"]
     never = (used == 0) & (pl.col("end") > pl.col("start"))
@@ -272,12 +305,15 @@ def _plausible(frame: pl.DataFrame) -> pl.DataFrame:
 
 
 def _running_time(tables: events.EventTables) -> pl.DataFrame:
-    """``tid, switched, used, running``: CPU time used by each thread at each of its switches."""
+    """Make a frame of how much CPU time each thread had used at each of its switches.
+
+    Columns: ``tid``; ``switched``, the instant (ns); ``used``, its CPU time until then (ns);
+    ``running``, whether it runs since.
+    """
     switches = events.table(tables, "sched_switch")
-    both = (("prev_tid", False), ("next_tid", True))
-    changes = pl.concat(
-        switches.select(tid=tid, switched="time", running=pl.lit(runs)) for tid, runs in both
-    )
+    off = switches.select(tid="prev_tid", switched="time", running=pl.lit(False))
+    on = switches.select(tid="next_tid", switched="time", running=pl.lit(True))
+    changes = pl.concat([off, on])
     changes = changes.filter(pl.col("tid") != 0)  # 0 is every core's idle thread
     changes = changes.sort("tid", "switched", "running", maintain_order=True)
     first = changes.unique("tid", keep="first", maintain_order=True).filter(~pl.col("running"))
@@ -290,9 +326,10 @@ def _running_time(tables: events.EventTables) -> pl.DataFrame:
 
 
 def timer_calls(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
-    """``callback_id, observed, pid, tid, time`` of timers' calls, where `rcl_timer_call` is there.
+    """Make a frame of the calls of timers: ``callback_id, observed, pid, tid, time`` (ns).
 
-    The thread need not be the one that runs the callback: rclcpp's events executor has one for it.
+    It is empty where the recording has no `rcl_timer_call`. The thread need not be the one that
+    runs the callback: rclcpp's events executor has a thread for the calls.
     """
     added = events.table(tables, "rclcpp_timer_callback_added")
     added = added.select("pid", "timer_handle", handle="callback", valid_from="time")
@@ -301,17 +338,19 @@ def timer_calls(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
         *("pid", "valid_from", "callback_id", "observed"), pl.coalesce("timer_handle", "handle")
     )
     calls = events.table(tables, "rcl_timer_call")
-    found = latest_before(calls, timers, ["pid", "timer_handle"], "time", "valid_from")
-    return found.drop_nulls("callback_id").select("callback_id", "observed", "pid", "tid", "time")
+    calls_of_timers = latest_before(calls, timers, ["pid", "timer_handle"], "time", "valid_from")
+    return calls_of_timers.drop_nulls("callback_id").select(
+        "callback_id", "observed", "pid", "tid", "time"
+    )
 
 
 def _with_assumed_readers(
     instances: pl.DataFrame, taken: pl.DataFrame, objects: Objects, tables: events.EventTables
 ) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Add an instance for every take, or timer's call, of what has no callback events.
+    """Add an instance for each take, and each timer's call, of callbacks that have no events.
 
-    Of services, clients and actions it ends when the thread's executor looks for work again.
-    Returns the instances, renumbered in order of start, and the takes with ``assumed_instance``.
+    Instances of services, clients and actions end when the thread's executor looks for work again.
+    Return the instances, renumbered in order of start, and the takes with ``assumed_instance``.
     """
     by_executor = (pl.col("kind") != "subscription") | pl.col("topic").str.contains(
         _ACTION, literal=True
@@ -334,35 +373,44 @@ def _with_assumed_readers(
         end = pl.when("by_executor").then("end")
         assumed = assumed.with_columns(end=end, assumed=end.is_null())
     assumed = assumed.drop("by_executor")
-    every = pl.concat([instances.drop("instance"), assumed], how="diagonal_relaxed")
-    every = every.sort("start", maintain_order=True).with_row_index("instance")
-    reading = every.select("take", "instance").drop_nulls("take")
-    of_take = by_number(reading, "take", "instance", taken.height)
-    return every.select(instances.columns), taken.with_columns(assumed_instance=of_take)
+    all_instances = pl.concat([instances.drop("instance"), assumed], how="diagonal_relaxed")
+    all_instances = all_instances.sort("start", maintain_order=True).with_row_index("instance")
+    reading = all_instances.select("take", "instance").drop_nulls("take")
+    instance_of_take = by_number(reading, "take", "instance", taken.height)
+    return all_instances.select(instances.columns), taken.with_columns(
+        assumed_instance=instance_of_take
+    )
 
 
 def _consumed(taken: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
-    """Add ``instance``: the next start of the subscription's callback on the thread of the take.
+    """Add to each take the ``instance`` that got its message.
 
-    Only when it comes before the thread's next take for that callback: an instance reads the
-    latest message taken for it, and a message is read by one instance.
+    It is the next instance of the subscription's callback on the thread of the take, if it starts
+    before that thread's next take for the callback: an instance reads the latest message that was
+    taken for it, and one instance reads a message.
     """
-    key = ["tid", "callback_id"]
+    thread_callback = ["tid", "callback_id"]
     for through_buffer in (False, True):
         same = pl.col("intra_process") == through_buffer
-        began = instances.filter(same & ~pl.col("assumed")).select(*key, "instance", "start")
-        got = taken.filter(same).select(*key, "take", took="time")
-        if began.height and got.height:
-            read = latest_before(began, got, key, "start", "took").drop_nulls("take")
-            # In order of start: of several instances after one take the first had it, so it
-            # comes last.
-            of_take = by_number(read.reverse(), "take", "instance", taken.height)
-            taken = taken.with_columns(assumed_instance=pl.coalesce("assumed_instance", of_take))
+        began = instances.filter(same & ~pl.col("assumed")).select(
+            *thread_callback, "instance", "start"
+        )
+        received = taken.filter(same).select(*thread_callback, "take", took="time")
+        if began.height and received.height:
+            read = latest_before(began, received, thread_callback, "start", "took").drop_nulls(
+                "take"
+            )
+            # Of several instances after one take the first read the message. Of several rows with
+            # one number `by_number` takes the last, so the order of starts is reversed.
+            instance_of_take = by_number(read.reverse(), "take", "instance", taken.height)
+            taken = taken.with_columns(
+                assumed_instance=pl.coalesce("assumed_instance", instance_of_take)
+            )
     return taken.rename({"assumed_instance": "instance"})
 
 
 def _answered(published: pl.DataFrame, taken: pl.DataFrame) -> pl.DataFrame:
-    """Responses belong to the instance that took the request: rclcpp sends them behind its end."""
+    """Give responses the instance that took the request: rclcpp sends them after its end."""
     requests = taken.filter(
         pl.col("call").is_not_null(),
         pl.col("instance").is_not_null(),
@@ -382,50 +430,52 @@ def _answered(published: pl.DataFrame, taken: pl.DataFrame) -> pl.DataFrame:
 def _published_in(
     published: pl.DataFrame, instances: pl.DataFrame, objects: Objects
 ) -> pl.DataFrame:
-    """Add ``instance`` and ``callback_id``: the innermost instance running on the thread then.
+    """Add ``instance`` and ``callback_id``: the innermost instance then running on the thread.
 
     An instance without an end is taken to run until the thread's next instance, or until its thread
-    looked for other work. A publication in
-    the nanosecond in which one instance ends and the next begins is the first one's. Where a
-    callback runs others inside itself (it spins an executor), what it publishes after them is its
-    own: the search is repeated among the instances that contain others, per level of nesting.
+    looked for other work. A publication in the nanosecond in which one instance ends and the next
+    begins belongs to the one that ends. A callback that spins an executor has instances of other
+    callbacks inside itself, and publishes after them: so the search is repeated among the
+    instances that contain others, once per level of nesting.
     """
     nodes = objects.callbacks.unique("callback_id", maintain_order=True)
     nodes = nodes.select("callback_id", owner=pl.col("node").cast(published.schema["node"]))
     running = instances.join(nodes, on="callback_id", how="left", maintain_order="left")
     running = running.drop("execution_ns", "intra_process")
     key, columns = ["pid", "tid"], ["publication", "instance", "callback_id"]
-    over = pl.coalesce("end", "until")
-    inside = (over.is_null() | (pl.col("time") <= over)) & (
+    over_by = pl.coalesce("end", "until")
+    lies_inside = (over_by.is_null() | (pl.col("time") <= over_by)) & (
         ~pl.col("assumed") | (pl.col("owner") == pl.col("node"))
     )
-    rest, found, strictly = published.select("publication", "time", *key, "node"), [], True
+    left_over, parts, strictly = published.select("publication", "time", *key, "node"), [], True
     while True:
-        hit = latest_before(rest, running, key, "time", "start", strictly=strictly)
-        hit = hit.filter(inside.fill_null(False) & pl.col("instance").is_not_null())
-        found.append(hit.select(columns))
-        hits = by_number(hit, "publication", "instance", published.height)
-        rest = rest.filter(hits.gather(rest["publication"]).is_null())
-        if not strictly:  # the second search is among all instances again
+        matches = latest_before(left_over, running, key, "time", "start", strictly=strictly)
+        matches = matches.filter(lies_inside.fill_null(False) & pl.col("instance").is_not_null())
+        parts.append(matches.select(columns))
+        instance_of = by_number(matches, "publication", "instance", published.height)
+        left_over = left_over.filter(instance_of.gather(left_over["publication"]).is_null())
+        # The first search is for instances that began before the publication, the second among the
+        # same for those that began in the same nanosecond; each later one is a level further out.
+        if not strictly:
             running = running.sort("start", maintain_order=True)
             inner_start, inner_end = (pl.col(n).shift(-1).over(key) for n in ("start", "end"))
             ends_within = (inner_end <= pl.col("end")).fill_null(True)
             contains = (inner_start < pl.col("end")) & ends_within
             running = running.filter(contains.fill_null(False))
-        if not (running.height and rest.height):
+        if not (running.height and left_over.height):
             break
         strictly = False
-    every = pl.concat(found)
+    all_matches = pl.concat(parts)
     return published.with_columns(
-        by_number(every, "publication", column, published.height) for column in columns[1:]
+        by_number(all_matches, "publication", column, published.height) for column in columns[1:]
     )
 
 
 def _with_restarts(flow: DataFlow) -> DataFlow:
-    """The flow in which the callbacks of a node that was started again are those of its last
-    process, with a note for each such node.
+    """The flow in which a node that was started again is one node, with a note for each.
 
-    A callback replaces an earlier one where its node, kind and trigger are the same.
+    Its callbacks are those of its last process. A callback replaces one of an earlier process that
+    has the same node, kind and trigger.
     """
     if flow.followed.is_empty():
         return flow
@@ -471,31 +521,36 @@ def _with_restarts(flow: DataFlow) -> DataFlow:
             )
             for contradiction in flow.contradictions
         ),
-        untold=frozenset(ids[number] for number in flow.untold),
+        without_takes=frozenset(ids[number] for number in flow.without_takes),
         notes=(*flow.notes, *notes),
     )
 
 
 def _begun_outside(published: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
-    """The publications, of which those of rclpy's timers are in no instance of a subscription.
+    """Take the publications of rclpy's timers out of the instances of subscriptions.
 
-    Where nothing tells of timers, a topic that was published before anything was taken is one's:
-    what came behind takes later is no output of theirs.
+    For recordings without `rcl_timer_call`. A publisher that published before its thread took any
+    message publishes for a timer, also where its later publications come after a take.
     """
     inside = pl.lit(instances["assumed"]).gather("instance")
     published = published.with_columns(assumed=inside)
     first = pl.col("instance").first().is_null()
-    own = (first & pl.col("assumed").fill_null(True).all()).over("publisher")
-    columns = (pl.when(~own).then(column).alias(column) for column in ("instance", "callback_id"))
+    of_timer = (first & pl.col("assumed").fill_null(True).all()).over("publisher")
+    columns = (
+        pl.when(~of_timer).then(column).alias(column) for column in ("instance", "callback_id")
+    )
     return published.with_columns(columns).drop("assumed")
 
 
 def _with_assumed_writers(
     objects: Objects, instances: pl.DataFrame, published: pl.DataFrame
 ) -> tuple[Objects, pl.DataFrame, pl.DataFrame]:
-    """Add a callback, and (last) instances, for topics published only outside callbacks."""
+    """Add a callback, and instances, for each topic that is published only outside callbacks.
+
+    The new instances come last.
+    """
     key, columns = ["pid", "node", "topic"], ["instance", "callback_id"]
-    # By publisher first: one number per row to group by instead of three.
+    # First by publisher, which is a single number a row instead of three columns.
     of_publisher = published.group_by("publisher").agg(
         pl.col(key).first(), inside=pl.col("instance").count(), valid_from=pl.col("time").min()
     )
@@ -507,14 +562,18 @@ def _with_assumed_writers(
     last: int | None = objects.callbacks.select(pl.col("callback_id").max()).item()
     first = 0 if last is None else last + 1
     outside = outside.sort("valid_from", "topic").with_row_index("callback_id", offset=first)
-    own = outside.select(*key, "callback_id")
-    assumed = published.drop(columns).join(own, on=key, maintain_order="left")
-    assumed = assumed.with_row_index("instance", offset=instances.height)
-    more = assumed.select(
+    callback_of_topic = outside.select(*key, "callback_id")
+    outside_publications = published.drop(columns).join(
+        callback_of_topic, on=key, maintain_order="left"
+    )
+    outside_publications = outside_publications.with_row_index("instance", offset=instances.height)
+    assumed_instances = outside_publications.select(
         *(*columns, "pid", "tid"), start="time", intra_process=pl.lit(False), assumed=pl.lit(True)
     )
     published = published.with_columns(
-        pl.coalesce(column, by_number(assumed, "publication", column, published.height))
+        pl.coalesce(
+            column, by_number(outside_publications, "publication", column, published.height)
+        )
         for column in columns
     )
     new = outside.select(
@@ -532,5 +591,7 @@ def _with_assumed_writers(
         for node, topic in outside.select("node", "topic").iter_rows()
     )
     objects = replace(objects, callbacks=callbacks, notes=(*objects.notes, *notes))
-    every = pl.concat([instances, more], how="diagonal").select(instances.columns)
-    return objects, every, published
+    all_instances = pl.concat([instances, assumed_instances], how="diagonal").select(
+        instances.columns
+    )
+    return objects, all_instances, published

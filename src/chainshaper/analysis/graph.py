@@ -3,19 +3,19 @@
 A callback is connected to a topic that its instances publish. Some messages are read in one
 callback and published in another of the same node:
 
-* **Synchronising callbacks** (message_filters) read in one instance and publish in that of the
-  input which completes the set; no event says so. A subscription callback is taken to be such an
-  input of topic X when another subscription callback of its node publishes X, subscribes to another
-  topic, and it either is registered by message_filters (its symbol says so) or publishes nothing.
-* **A synchroniser of the application's own** keeps its latest inputs, and publishes in the callback
-  of whichever comes last. Several subscription callbacks of a node that publish topic X are taken
-  to be its inputs when each of them ran as often as X was published: ``Callback.in_turns``.
+* **Synchronising callbacks** (message_filters) read a message each; the one whose message completes
+  the set publishes. No event shows that. A subscription callback counts as an input of topic X when
+  another subscription callback of its node publishes X and subscribes to another topic, and
+  message_filters registered this one (its symbol says so) or it publishes nothing itself.
+* **A synchroniser that the application wrote** stores its latest inputs, and publishes in the
+  callback of whichever comes last. Several subscription callbacks of a node that publish topic X
+  are its inputs when each of them ran as often as X was published: ``Callback.in_turns``.
 * **An action's goal** leads to the feedback that its server's node publishes next.
-* **Stored messages**: a subscription callback in a node whose subscription callbacks publish
-  nothing at all, but whose timers do, is taken to store the message for the timers.
+* **Stored messages**: in a node whose subscription callbacks publish nothing at all, but whose
+  timers do, a subscription callback stores its message for the timers.
 
-All are inferences. What a callback never publishes itself stands in ``Callback.publishes`` and also
-in ``passes_on``.
+All of these are inferences. A topic that only another callback publishes for this one stands in
+``Callback.publishes`` and also in ``passes_on``.
 """
 
 from collections import defaultdict
@@ -31,16 +31,16 @@ from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Callback, Node
 
 MESSAGE_FILTER = "message_filters::"
-"""What the symbols of callbacks that message_filters registered contain."""
+"""This stands in the symbols of callbacks that message_filters registered."""
 
 
 def application_graph(tables: events.EventTables) -> ApplicationGraph:
-    """The graph of callbacks (by the ids of analysis frames) and topics that events show."""
+    """Make the graph of callbacks and topics that events show; ids are those of the data flow."""
     return graph_of(data_flow(tables))
 
 
 def graph_of(flow: DataFlow) -> ApplicationGraph:
-    """The application graph of a recording whose data flow is known already."""
+    """Make the application graph of a data flow."""
     pairs = flow.publications.lazy().select("callback_id", "topic").drop_nulls().unique()
     writes = defaultdict[int, set[str]](set)
     for callback_id, topic in pairs.collect().iter_rows():
@@ -66,11 +66,13 @@ def graph_of(flow: DataFlow) -> ApplicationGraph:
     created = flow.objects.nodes.select("node", "pid").unique(maintain_order=True).iter_rows()
     nodes = dict.fromkeys((node, last.get((node, pid), pid)) for node, pid in created)
     complete = []
-    for one in callbacks:
-        passed = _passed_on(one, of_node[one.pid, one.node])
-        sets = ({*one.publishes, *passed}, passed, turns[one.id])
+    for callback in callbacks:
+        passed = _passed_on(callback, of_node[callback.pid, callback.node])
+        sets = ({*callback.publishes, *passed}, passed, turns[callback.id])
         publishes, passes_on, in_turns = (tuple(sorted(topics)) for topics in sets)
-        complete.append(replace(one, publishes=publishes, passes_on=passes_on, in_turns=in_turns))
+        complete.append(
+            replace(callback, publishes=publishes, passes_on=passes_on, in_turns=in_turns)
+        )
     return ApplicationGraph(
         nodes=tuple(Node(name, pid, earlier[name, pid]) for name, pid in nodes),
         callbacks=tuple(complete),
@@ -80,54 +82,60 @@ def graph_of(flow: DataFlow) -> ApplicationGraph:
 
 
 def _passed_on(callback: Callback, siblings: list[Callback]) -> set[str]:
-    """The topics that another callback of its node publishes for one."""
-    own = set(callback.publishes)
+    """The topics that other callbacks of its node publish for a callback."""
+    published_itself = set(callback.publishes)
     if callback.kind == "service":  # an action's: a thread of the goal publishes as a rule
         action, goal, _ = (callback.topic or "").partition("/_action/send_goal")
-        published = {topic for one in siblings for topic in one.publishes}
-        return {f"{action}/_action/feedback"} & published - own if goal else set()
+        published = {topic for sibling in siblings for topic in sibling.publishes}
+        return {f"{action}/_action/feedback"} & published - published_itself if goal else set()
     if callback.kind != "subscription" or callback.topic in {None, *INTERNAL_TOPICS}:
         return set()
     if not _outputs(siblings, "subscription"):
         return _outputs(siblings, "timer")
-    if MESSAGE_FILTER in (callback.symbol or "") or not own - INTERNAL_TOPICS:
-        others = [one for one in siblings if one.topic != callback.topic]
-        return _outputs(others, "subscription") - own  # none synchronises a topic with itself
+    if MESSAGE_FILTER in (callback.symbol or "") or not published_itself - INTERNAL_TOPICS:
+        of_other_topics = [sibling for sibling in siblings if sibling.topic != callback.topic]
+        return (
+            _outputs(of_other_topics, "subscription") - published_itself
+        )  # none synchronises a topic with itself
     return set()
 
 
 def _in_turns(flow: DataFlow, nodes: Iterable[list[Callback]]) -> dict[int, set[str]]:
-    """Which topics each callback writes in turns with others of its node, as their synchroniser.
+    """Map callbacks to the topics that they publish in turns with others of their node.
 
-    By the k-th publication since the first each of them has run k times: callbacks that publish
-    independently of each other do not keep to that. An instance that begins while the set is being
-    published may be part of it: of two that begin at once on two threads, either completes it.
+    They are inputs of a synchroniser: by the k-th publication since the first, each of them has run
+    at least k times, which is not so of callbacks that publish independently. An instance that
+    begins while the set is being published may be part of it: of two that begin at the same time on
+    two threads, either may complete the set.
     """
-    found = defaultdict[int, set[str]](set)
+    topics_of = defaultdict[int, set[str]](set)
     for callbacks in nodes:
         for topic in _outputs(callbacks, "subscription"):
             writers = [c for c in callbacks if topic in c.publishes and c.kind != "unknown"]
-            inputs = {one.topic for one in writers if one.kind == "subscription"}
+            inputs = {writer.topic for writer in writers if writer.kind == "subscription"}
             if len(writers) < 2 or len(inputs) < len(writers):
-                continue  # one alone; or a timer publishes it too, or two callbacks of one topic do
-            ids = [one.id for one in writers]
-            own = flow.publications.filter(pl.col("callback_id").is_in(ids), topic=topic)
-            written = own.join(flow.instances, on="instance").sort("start")
+                continue  # a single writer, or a timer among them, or two inputs of one topic
+            ids = [writer.id for writer in writers]
+            of_writers = flow.publications.filter(pl.col("callback_id").is_in(ids), topic=topic)
+            written = of_writers.join(flow.instances, on="instance").sort("start")
             if len(written) < 2:
-                continue  # nothing lies between
+                continue  # there is no span between two publications
             since, until = written["start"][0], written["time"][1:]
             ran = flow.instances.filter(pl.col("callback_id").is_in(ids), pl.col("start") > since)
             ran = ran.sort("start")
-            starts = (ran.filter(callback_id=one)["start"] for one in ids)
+            starts = (ran.filter(callback_id=number)["start"] for number in ids)
             places = np.arange(1, len(written))
-            if all((one.search_sorted(until).to_numpy() >= places).all() for one in starts):
+            if all((begun.search_sorted(until).to_numpy() >= places).all() for begun in starts):
                 for number in ids:
-                    found[number].add(topic)
-    return found
+                    topics_of[number].add(topic)
+    return topics_of
 
 
 def _outputs(callbacks: list[Callback], kind: str) -> set[str]:
-    topics = {topic for one in callbacks if one.kind == kind for topic in one.publishes}
+    """The topics that callbacks of a kind publish."""
+    topics = {
+        topic for callback in callbacks if callback.kind == kind for topic in callback.publishes
+    }
     return topics - INTERNAL_TOPICS
 
 
@@ -139,46 +147,42 @@ def _by_topic(endpoints: pl.DataFrame) -> dict[str, tuple[str, ...]]:
 
 
 def goes_on_elsewhere(graph: ApplicationGraph, callback: Callback, topic: str) -> bool:
-    """Whether what ``callback`` reads may leave on ``topic`` through another of its node.
+    """Whether a message that ``callback`` reads may leave on ``topic`` through a sibling.
 
-    So it is for callbacks that pass the topic on, or write it in turns, and, since the last input
-    completes a set, for the siblings that publish it. Where each of several callbacks publishes the
-    topic, they are inputs of one synchroniser if message_filters registered them, or if nothing is
-    known about who did; otherwise they publish independently.
+    It may where the callback passes the topic on, or publishes it in turns. It also may where a
+    sibling passes the topic on, for any input may be the last of its set. Where each of several
+    callbacks publishes the topic, they are inputs of one synchroniser if message_filters registered
+    them, or if no event says who did; otherwise they publish independently.
     """
     if callback.kind != "subscription":
         return False
     siblings = [
-        other
-        for other in graph.callbacks
-        if other.id != callback.id
-        and (other.pid, other.node) == (callback.pid, callback.node)
-        and topic in other.publishes
+        sibling
+        for sibling in graph.callbacks
+        if sibling.id != callback.id
+        and (sibling.pid, sibling.node) == (callback.pid, callback.node)
+        and topic in sibling.publishes
     ]
     if topic in {*callback.passes_on, *callback.in_turns} or any(
-        topic in other.passes_on for other in siblings
+        topic in sibling.passes_on for sibling in siblings
     ):
         return True
     filtered = callback.symbol is None or MESSAGE_FILTER in callback.symbol
-    return filtered and any(other.kind == "subscription" for other in siblings)
+    return filtered and any(sibling.kind == "subscription" for sibling in siblings)
 
 
 @dataclass(frozen=True)
 class ApplicationDescription:
-    """Everything that a picture of an application shows.
-
-    ``services`` is the frame of :func:`services`; ``lost`` and ``notes`` are what a reader must
-    know about how complete it is.
-    """
+    """Everything that a picture of an application shows."""
 
     graph: ApplicationGraph
-    services: pl.DataFrame
-    lost: dict[str, int]
-    notes: tuple[str, ...]
+    services: pl.DataFrame  # see `services`
+    lost: dict[str, int]  # number of events that are missing, by table
+    notes: tuple[str, ...]  # what cannot be known, in plain words
 
 
 def services(tables: events.EventTables) -> pl.DataFrame:
-    """All services: ``service, role, node, pid``, one row per server and client."""
+    """Make a frame of all services: ``service, role, node, pid``, a row per server and client."""
     roles = {"service": "server", "client": "client"}
     ends = endpoints(tables).filter(pl.col("role").is_in([*roles]))
     columns = ["service", "role", "node", "pid"]

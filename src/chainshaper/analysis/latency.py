@@ -30,25 +30,18 @@ PERCENTILES: tuple[float, ...] = (0.5, 1, 5, 25, 50, 75, 95, 99, 99.5)
 
 @dataclass(frozen=True)
 class LatencyStatistics:
-    """Statistics of a sample of latencies, in whole nanoseconds; None where there is no sample.
+    """Statistics of a sample of latencies, in whole nanoseconds; None where there is no sample."""
 
-    ``count`` latencies were measured; ``incomplete`` traversals have none, but for those that came
-    to a lifecycle node while it was not active; ``disturbed`` of ``count`` were hit by a stall of
-    the machine; ``late`` of them came behind the slot or cycle they were due in (None: not known).
-    ``jitter_ns`` is max − min (paper: J), ``spread_ns`` p99.5 − p0.5. ``percentiles_ns`` has
-    :data:`PERCENTILES` as text for keys; they interpolate linearly between the two nearest values.
-    """
-
-    count: int
-    incomplete: int
-    disturbed: int
+    count: int  # of latencies
+    incomplete: int  # of traversals without a latency, less those that met an inactive node
+    disturbed: int  # how many of `count` were hit by a stall of the machine
     min_ns: int | None
     mean_ns: int | None
     max_ns: int | None
-    jitter_ns: int | None
-    spread_ns: int | None
-    percentiles_ns: dict[str, int]
-    late: int | None = None
+    jitter_ns: int | None  # max − min (paper: J)
+    spread_ns: int | None  # p99.5 − p0.5
+    percentiles_ns: dict[str, int]  # by `PERCENTILES` as text; linear between the nearest values
+    late: int | None = None  # how many of `count` left behind their slot or cycle; None: not known
 
 
 def latency_statistics(
@@ -57,9 +50,9 @@ def latency_statistics(
     incomplete: int = 0,
     late: int | None = None,
 ) -> LatencyStatistics:
-    """Statistics of latencies in ns; ``disturbed`` marks those that the machine hit.
+    """Compute statistics of latencies in ns; ``disturbed`` marks those that a stall hit.
 
-    Disturbed latencies are counted and included: to leave them out, pass the others only.
+    Disturbed latencies are counted and included. To leave them out, pass only the undisturbed ones.
     """
     sample = np.asarray(latency_ns, dtype=np.int64)
     hit = 0 if disturbed is None else int(np.count_nonzero(np.asarray(disturbed, dtype=bool)))
@@ -69,8 +62,18 @@ def latency_statistics(
     percentiles = {f"{p:g}": round(float(v)) for p, v in zip(PERCENTILES, values, strict=True)}
     low, high, mean = int(sample.min()), int(sample.max()), round(int(sample.sum()) / len(sample))
     spread = percentiles["99.5"] - percentiles["0.5"]
-    figures = (low, mean, high, high - low, spread, percentiles)
-    return LatencyStatistics(len(sample), incomplete, hit, *figures, late)
+    return LatencyStatistics(
+        count=len(sample),
+        incomplete=incomplete,
+        disturbed=hit,
+        min_ns=low,
+        mean_ns=mean,
+        max_ns=high,
+        jitter_ns=high - low,
+        spread_ns=spread,
+        percentiles_ns=percentiles,
+        late=late,
+    )
 
 
 def summary(times: pl.Expr) -> pl.Expr:
@@ -80,13 +83,17 @@ def summary(times: pl.Expr) -> pl.Expr:
 
 
 def callback_statistics(flow: DataFlow) -> pl.DataFrame:
-    """Count, response and execution times of every callback that was seen to run, one row each.
+    """Make a frame of every callback that was seen to run, one row each. Columns:
 
-    Columns: ``callback_id, node, kind, topic, period_ns, declared_ns, symbol, pid, pids, tids,
-    count, unfinished, response_ns, execution_ns``. The last two are structs ``{min, mean, max}`` in
-    ns (means as floats), null where no instance has such a time. ``period_ns`` is the period of a
-    timer's starts, ``declared_ns`` that with which it was created, ``pids`` are all
-    processes of a node that was started again, ``pid`` is the last.
+    * ``callback_id, node, kind, topic, symbol``.
+    * ``period_ns``: the period of a timer's starts.
+    * ``declared_ns``: the period with which the timer was created.
+    * ``pid``: its process, the last one of a node that was started again; ``pids``: all of them.
+    * ``tids``: the threads that ran it.
+    * ``count``: of its instances.
+    * ``unfinished``: how many of these have no end.
+    * ``response_ns``, ``execution_ns``: structs ``{min, mean, max}`` in ns (means are floats); null
+      where no instance has such a time.
     """
     # Of a callback's registrations those of its node's last process come first.
     about = flow.objects.callbacks.unique("callback_id", keep="first", maintain_order=True)
@@ -100,27 +107,28 @@ def callback_statistics(flow: DataFlow) -> pl.DataFrame:
         execution_ns=summary(pl.col("execution_ns")),
     )
     names = ("callback_id", "node", "kind", "topic", "period_ns", "declared_ns", "symbol", "pid")
-    found = about.select(names).join(figures, on="callback_id")
-    return found.sort("callback_id")
+    joined = about.select(names).join(figures, on="callback_id")
+    return joined.sort("callback_id")
 
 
 def named_callbacks(flow: DataFlow) -> pl.DataFrame:
-    """Callbacks that ran and are named alike in every run: by node, and ``starts``, what starts
-    them: a topic, or a timer with its declared period. Several may have one name: two timers of one
-    period, or those of a node started again. ``shown`` has the period of the timer's starts, too.
+    """Select the callbacks that have the same name in every run: node, and what starts them.
 
-    They are rows of :func:`.callback_statistics`, without those that every node has.
+    They are rows of :func:`.callback_statistics`, without callbacks that every node has. Two more
+    columns: ``starts``, the topic or the timer's declared period; ``shown``, the same with the
+    period of the timer's starts beside the declared one. Several callbacks may have one name: two
+    timers of one period, or those of a node that was started again.
     """
-    found = callback_statistics(flow).filter(
+    callbacks = callback_statistics(flow).filter(
         pl.col("node").is_not_null()
         & pl.col("kind").is_in(["timer", "subscription"])
         & ~pl.col("topic").fill_null("").is_in(list(INTERNAL_TOPICS))
     )
-    triggers = found.select("topic", "period_ns", "declared_ns").rows()
+    triggers = callbacks.select("topic", "period_ns", "declared_ns").rows()
     starts = [trigger_text(topic, declared) for topic, _, declared in triggers]
     shown = [trigger_text(*trigger) for trigger in triggers]
     texts = {"starts": starts, "shown": shown}
-    return found.with_columns(pl.Series(name, text, pl.String) for name, text in texts.items())
+    return callbacks.with_columns(pl.Series(name, text, pl.String) for name, text in texts.items())
 
 
 class Longest(NamedTuple):
@@ -140,7 +148,7 @@ class Longest(NamedTuple):
 
 
 def longest_times(flow: DataFlow) -> dict[tuple[str, str], Longest]:
-    """The longest times of each name of :func:`named_callbacks`."""
+    """Map each name of :func:`named_callbacks`, node and ``starts``, to its longest times."""
     named = named_callbacks(flow).group_by("node", "starts", maintain_order=True)
     rows = named.agg(
         response=pl.col("response_ns").struct.field("max").max(),
@@ -151,84 +159,89 @@ def longest_times(flow: DataFlow) -> dict[tuple[str, str], Longest]:
 
 
 class Executor(NamedTuple):
-    """The threads of a process that run the same callbacks.
-
-    ``threads`` are their ids, each with the nodes it ran callbacks of, ``callbacks`` these by id,
-    ``names`` the timers and subscriptions among them by node and trigger, without those that every
-    node has for itself (`/clock` may have a thread of its own).
-    """
+    """The threads of a process that run the same callbacks."""
 
     pid: int
-    threads: dict[int, tuple[str, ...]]
-    callbacks: frozenset[int]
+    threads: dict[int, tuple[str, ...]]  # thread id → the nodes whose callbacks it ran
+    callbacks: frozenset[int]  # their ids
     names: tuple[tuple[str, str], ...]
+    """Node and trigger of the timers and subscriptions among them. Those that every node has are
+    left out: `/clock` may have a thread of its own."""
 
 
 def executors(flow: DataFlow) -> list[Executor]:
-    """Which callbacks have an executor of their own (paper, section 6): they share no thread.
+    """Find the executors of a recording (paper, section 6): groups of callbacks that share threads.
 
-    What one thread was seen to run is one executor's, and so is what several take turns with. A
-    thread that calls the timers for it belongs to it (rclcpp's events executor), and of several of
-    Python the main thread, which gives them their work.
+    Callbacks that ran on one thread have one executor, and so have all that ran on any of its
+    threads. A thread that calls the timers belongs to their executor (rclcpp's events executor). In
+    Python the main thread belongs to it as well: it gives the others their work.
     """
-    found: list[Executor] = []
-    who = ("callback_id", "pid", "tid")  # threads of processes that were followed are no more
-    calls = timer_calls(flow.events, flow.objects).select(who)
-    ran = pl.concat([flow.instances.select(who), calls]).unique()
-    about = flow.objects.callbacks.filter((pl.col("kind") != "unknown") | pl.col("observed"))
-    about = about.unique("callback_id", keep="first", maintain_order=True).join(
+    listed: list[Executor] = []
+    columns_of_runs = ("callback_id", "pid", "tid")
+    calls = timer_calls(flow.events, flow.objects).select(columns_of_runs)
+    ran = pl.concat([flow.instances.select(columns_of_runs), calls]).unique()
+    known = flow.objects.callbacks.filter((pl.col("kind") != "unknown") | pl.col("observed"))
+    # Of a node that was started again only the threads of its last process count.
+    known = known.unique("callback_id", keep="first", maintain_order=True).join(
         ran.group_by("callback_id", "pid").agg(tids=pl.col("tid").sort()),
         on=["callback_id", "pid"],
     )
     # A timer's declared period names it: it is the same whatever the recording shows.
     columns = ("callback_id", "node", "kind", "topic", "declared_ns", "pid", "tids", "observed")
-    for row in about.sort("callback_id").select(*columns).iter_rows():
+    for row in known.sort("callback_id").select(*columns).iter_rows():
         number, node, kind, topic, declared_ns, pid, tids, observed = row
         tids = tids if observed else {pid, *tids}
         threads: dict[int, tuple[str, ...]] = dict.fromkeys(tids, (node,))
         callbacks, names = frozenset((number,)), tuple[tuple[str, str], ...]()
         if kind in ("timer", "subscription") and topic not in INTERNAL_TOPICS:
             names = ((node, trigger_text(topic, declared_ns)),)
-        for one in [one for one in found if one.pid == pid and one.threads.keys() & threads]:
-            found.remove(one)
-            for tid, nodes in one.threads.items():
+        for executor in [
+            executor
+            for executor in listed
+            if executor.pid == pid and executor.threads.keys() & threads
+        ]:
+            listed.remove(executor)
+            for tid, nodes in executor.threads.items():
                 threads[tid] = tuple(dict.fromkeys((*nodes, *threads.get(tid, ()))))
-            callbacks, names = callbacks | one.callbacks, tuple(dict.fromkeys(one.names + names))
-        found.append(Executor(pid, threads, callbacks, names))
-    return found
+            callbacks, names = (
+                callbacks | executor.callbacks,
+                tuple(dict.fromkeys(executor.names + names)),
+            )
+        listed.append(Executor(pid, threads, callbacks, names))
+    return listed
 
 
 @dataclass(frozen=True)
 class LatencyAnalysis:
     """The end-to-end latency of one chain in one recording.
 
-    ``traversals`` is the frame of :class:`~chainshaper.analysis.traversals.Traversals` with
-    ``place_ns``, ``due_at``, ``late`` (:func:`~.disturbance.with_punctuality`), ``was_due``
-    (:func:`~.outputs_due.with_outputs_due`), ``disturbed``,
-    ``received``, ``reception_ns`` (latency to the subscriber's `callback_start`) and
-    ``reception_disturbed`` (also by a stall between the two), ``hops`` its frame of hops,
-    ``releases`` what gates decided about them (:func:`~.messages.gated_hops`). ``statistics`` are
-    over all complete traversals, ``undisturbed`` over those that the machine did not disturb;
-    ``subscriber`` and ``subscriber_undisturbed`` are the same of ``reception_ns`` (None: no node
-    subscribes to the output). ``incomplete`` counts traversals without an end by reason, ``silent``
-    instances of the first callback that began none, ``not_begun`` cycles of a plan in which it did
-    not run at all. ``period_ns`` is that of the timer that starts the chain (None: none does).
+    ``traversals`` is the frame of :class:`~chainshaper.analysis.traversals.Traversals` with further
+    columns:
+
+    * ``place_ns``, ``due_at``, ``late``: see :func:`~.disturbance.with_punctuality`.
+    * ``was_due``: see :func:`~.outputs_due.with_outputs_due`.
+    * ``disturbed``: whether a stall of the machine hit it.
+    * ``received``: when the subscriber's callback started with the output (ns, null: never).
+    * ``reception_ns``: the latency until then.
+    * ``reception_disturbed``: whether a stall hit it, or the delivery of its output.
     """
 
     chain: Chain
     graph: ApplicationGraph
     traversals: pl.DataFrame
-    hops: pl.DataFrame
-    releases: pl.DataFrame
-    statistics: LatencyStatistics
-    undisturbed: LatencyStatistics
-    subscriber: LatencyStatistics | None
-    subscriber_undisturbed: LatencyStatistics | None
-    incomplete: dict[str, int]
-    silent: int
+    hops: pl.DataFrame  # see `Traversals`
+    releases: pl.DataFrame  # what gates decided about these hops: `messages.gated_hops`
+    statistics: LatencyStatistics  # over all complete traversals
+    undisturbed: LatencyStatistics  # over those that no stall disturbed
+    subscriber: (
+        LatencyStatistics | None
+    )  # of `reception_ns`; None: no node subscribes to the output
+    subscriber_undisturbed: LatencyStatistics | None  # over those not `reception_disturbed`
+    incomplete: dict[str, int]  # number of traversals without an end, by reason
+    silent: int  # instances of the first callback that began no traversal
     notes: tuple[str, ...]
-    not_begun: int = 0
-    period_ns: int | None = None
+    not_begun: int = 0  # cycles of a plan in which the first callback did not run
+    period_ns: int | None = None  # of the timer that starts the chain; None: no timer does
 
     @property
     def decided(self) -> pl.DataFrame:
@@ -249,12 +262,13 @@ def analyse_latency(
     due: Sequence[Due] = (),
     between: tuple[int, int | None] | None = None,
 ) -> LatencyAnalysis:
-    """Every traversal of ``chain`` in a recording, with statistics.
+    """Measure every traversal of ``chain`` in a recording, with statistics.
 
-    ``clock_offset_ns`` (event clock to CLOCK_REALTIME) is taken from a recording and needed for
-    tables from before Jazzy. ``due`` is when a plan has outputs leave; those of other chains are
-    passed over. ``between`` leaves out traversals that did not begin, and end, between two instants
-    (ns).
+    * ``clock_offset_ns``: CLOCK_REALTIME less the clock of events. A recording has it; tables from
+      before Jazzy need it.
+    * ``due``: when a plan has outputs leave. What is due of other chains is ignored.
+    * ``between``: two instants (ns; the second may be None). Traversals that did not both begin and
+      end between them are left out.
 
     Raises InputError: the chain is not in the recording, see :func:`~.chains.find_chain`.
     """
@@ -269,21 +283,28 @@ def analyse_latency(
     graph = graph_of(flow)
     if isinstance(chain, str):
         chain = find_chain(graph, chain)
-    found = traverse(flow, chain, graph)
-    own = next((one for one in due if one.output in {None, chain.topics[-1]}), None)
-    judged, releases = with_punctuality(flow, found, own)
-    hit = pl.Series(disturbed(flow, judged, 0 if own is None else own.margin_ns))
-    received = reception(flow, found, graph)
+    traversals = traverse(flow, chain, graph)
+    own_due = next(
+        (
+            due_of_output
+            for due_of_output in due
+            if due_of_output.output in {None, chain.topics[-1]}
+        ),
+        None,
+    )
+    judged, releases = with_punctuality(flow, traversals, own_due)
+    stalled = pl.Series(disturbed(flow, judged, 0 if own_due is None else own_due.margin_ns))
+    received = reception(flow, traversals, graph)
     sent, arrived = judged["end"].fill_null(0), received["received"].fill_null(-1)
     on_its_way = pl.Series(stalled_after(flow, sent.to_numpy(), arrived.to_numpy()))
     frame = judged.drop("origin", "computed_at", "expected_at").with_columns(
         *(received["received"], received["reception_ns"]),
-        disturbed=hit,
-        reception_disturbed=hit | on_its_way,
+        disturbed=stalled,
+        reception_disturbed=stalled | on_its_way,
     )
     until = None if between is None else between[1]
-    frame = with_outputs_due(flow, frame, releases, due_within(flow, chain, own), until)
-    hops = found.hops
+    frame = with_outputs_due(flow, frame, releases, due_within(flow, chain, own_due), until)
+    hops = traversals.hops
     if between is not None:
         since_ns, until_ns = between
         ended = pl.max_horizontal("start", "end")
@@ -292,7 +313,7 @@ def analyse_latency(
         hops, releases = (t.join(frame, on="traversal", how="semi") for t in (hops, releases))
     reasons = frame.select("reason").drop_nulls().group_by("reason").len().sort("reason")
     calm, well_received = (frame.filter(~pl.col(f"{of}disturbed")) for of in ("", "reception_"))
-    read = frame["reception_ns"].count() > 0
+    subscribed = frame["reception_ns"].count() > 0
     return LatencyAnalysis(
         chain=chain,
         graph=graph,
@@ -301,17 +322,18 @@ def analyse_latency(
         releases=releases,
         statistics=_statistics(frame, "latency_ns"),
         undisturbed=_statistics(calm, "latency_ns"),
-        subscriber=_statistics(frame, "reception_ns") if read else None,
-        subscriber_undisturbed=_statistics(well_received, "reception_ns") if read else None,
+        subscriber=_statistics(frame, "reception_ns") if subscribed else None,
+        subscriber_undisturbed=_statistics(well_received, "reception_ns") if subscribed else None,
         incomplete=dict(reasons.iter_rows()),
-        silent=found.silent,
-        notes=(*notes, *flow.notes, *found.notes),
-        not_begun=0 if own is None else not_begun(flow, chain, own, between),
+        silent=traversals.silent,
+        notes=(*notes, *flow.notes, *traversals.notes),
+        not_begun=0 if own_due is None else not_begun(flow, chain, own_due, between),
         period_ns=timer_period(flow, chain),
     )
 
 
 def _statistics(frame: pl.DataFrame, column: str) -> LatencyStatistics:
+    """Compute statistics of ``latency_ns`` or ``reception_ns`` over traversals."""
     measured = frame.drop_nulls(column)
     known = measured["late"].count() or not measured.height
     hit = "disturbed" if column == "latency_ns" else "reception_disturbed"

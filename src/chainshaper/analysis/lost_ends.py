@@ -1,10 +1,10 @@
 """Ends of callback instances that events of the same thread disprove.
 
 Where the end of one instance and the start of the next are both lost, the first start and the last
-end look like one long instance. What the thread did in between tells: an executor takes up work
-only when no callback runs. It takes the next message for the same callback, or it looks, or waits,
-for work, or runs another callback. A callback that spins an executor itself does the same, but as
-its habit: what hardly any of its other instances did is not.
+end look like one long instance. The thread's events in between disprove that: an executor takes up
+work only when no callback runs. It takes the next message for the same callback, or it looks, or
+waits, for work, or runs another callback. A callback that spins an executor itself does the same,
+but as a habit: so the events count only if few of the callback's instances have them.
 """
 
 from dataclasses import dataclass
@@ -18,12 +18,13 @@ LOOKS = ("rclcpp_executor_get_next_ready", "rclcpp_executor_wait_for_work")
 """The events of an executor that looks for work."""
 
 HABIT = 0.2
-"""A callback in which an executor looks for work in more than this share of its instances spins one
-itself."""
+"""If an executor looks for work in more than this share of a callback's instances, the callback
+spins an executor itself."""
 MOST_TAKEN = 0.5
-"""A callback in which its own next message is taken in more than this share does that itself."""
-_OFTEN = 0.5  # of a callback's usual distance of starts: two instances and a gap are longer
-_LONGER = 1.5  # times its usual response time
+"""If its next message is taken in more than this share of a callback's instances, the callback
+takes it itself."""
+_OFTEN = 0.5  # share of the usual distance of starts from which an instance may be two
+_LONGER = 1.5  # times the usual response time from which it may be two
 _NO_TIME = pl.lit(None, dtype=pl.Int64)
 _NONE = pl.Series([], dtype=pl.UInt32)
 
@@ -32,10 +33,13 @@ _NONE = pl.Series([], dtype=pl.UInt32)
 class LostEnds:
     """Callback instances, without the ends that cannot be theirs.
 
-    ``instances`` has the column ``until`` as well: by when an instance without an end had ended
-    (null: not known). ``by_take`` are the numbers of those that the thread's next take, or
-    execution, of the same callback disproves, ``by_wait`` of those that only its search for other
-    work does. If no event was lost (``complete``), the latter have their ends.
+    * ``instances``: the frame with one more column, ``until``: when an instance without an end had
+      ended at the latest (ns, null: not known).
+    * ``by_take``: numbers of the instances whose end is disproved because the thread took, or
+      executed, the same callback's next message or timer before it.
+    * ``by_wait``: numbers of those whose end is disproved only because the thread looked for other
+      work before it. If no event was lost, they still have their ends.
+    * ``complete``: whether no event was lost.
     """
 
     instances: pl.DataFrame
@@ -52,24 +56,24 @@ def without_disproved_ends(
     *,
     complete: bool,
 ) -> LostEnds:
-    """Look for ends that the thread's other events disprove, and leave them out.
+    """Find the ends that other events of the thread disprove, and leave them out.
 
     Where no event was lost (``complete``), an instance in which the thread looked for work, or took
-    a message, did so itself: as shaping nodes do, which take what comes while they hold a message.
+    a message, did so itself. Shaping nodes do that: they take messages while they hold another one.
 
-    The executor's events are asked only where an instance is suspiciously long, or has no end: as
-    a rule no other step needs them.
+    The events of executors are read only if an instance is suspiciously long, or has no end: as a
+    rule no other step needs these large tables.
     """
     thread, key = ["pid", "tid"], ["tid", "callback_id"]
-    own = taken.filter(~pl.col("intra_process")).drop_nulls("callback_id")
-    own = own.select(*key, took="time")
-    rows = first_after(instances, own, key, "start", "took", strictly=True)
+    takes = taken.filter(~pl.col("intra_process")).drop_nulls("callback_id")
+    takes = takes.select(*key, took="time")
+    rows = first_after(instances, takes, key, "start", "took", strictly=True)
     if not _suspicious(rows):
         return LostEnds(instances.with_columns(until=_NO_TIME), _NONE, _NONE, complete)
     if complete:
-        own = own.clear()
-    own = pl.concat([own, _executions_of_timers(tables, callbacks)]).sort("took")
-    rows = first_after(rows.drop("took"), own, key, "start", "took", strictly=True)
+        takes = takes.clear()
+    takes = pl.concat([takes, _executions_of_timers(tables, callbacks)]).sort("took")
+    rows = first_after(rows.drop("took"), takes, key, "start", "took", strictly=True)
     looks = pl.concat(events.table(tables, name).select(*thread, looked="time") for name in LOOKS)
     rows = first_after(rows, looks.sort("looked"), thread, "start", "looked", strictly=True)
     # The next instance on the thread is of another callback, or this one has no end already.
@@ -93,7 +97,10 @@ def without_disproved_ends(
 
 
 def _executions_of_timers(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFrame:
-    """``tid, callback_id, took``: when an executor took up a timer, of which there are no takes."""
+    """Make a frame of when executors took up timers, which take no message.
+
+    Columns: ``tid``, ``callback_id``, ``took`` (ns).
+    """
     added = events.table(tables, "rclcpp_timer_callback_added")
     added = added.select("pid", "timer_handle", handle="callback", valid_from="time")
     timers = callbacks.join(added, on=["pid", "handle", "valid_from"])
@@ -104,8 +111,11 @@ def _executions_of_timers(tables: events.EventTables, callbacks: pl.DataFrame) -
 
 
 def _suspicious(rows: pl.DataFrame) -> bool:
-    """Whether an instance may be two: the next take lies inside it, or it is longer than usual, and
-    nearly as long as starts are apart, or another one began on its thread though it has no end."""
+    """Whether some instance may be two.
+
+    It may be if the callback's next take lies inside it; or if it has no end and another instance
+    began on its thread; or if it is longer than usual, and not much shorter than starts are apart.
+    """
     if (rows["took"] < rows["end"]).any():
         return True
     if rows["end"].null_count():

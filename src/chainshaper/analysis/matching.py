@@ -1,10 +1,10 @@
 """Matching events to events by time: the joins that the rest of the analysis is built from.
 
-An event rarely names what it belongs to. It carries an address, which means whatever was last
-created there, or it belongs to whatever its thread was doing then: "the latest row before this one
-with the same key" (or the next after it), an asof join. Events come sorted by time, so one walk
-over both tables that remembers the latest row of each key is enough (core/matching): some ten ns a
-row.
+An event rarely names what it belongs to. It has an address, which means the object that was last
+created there; or it belongs to what its thread was doing then. Both are "the latest row before this
+one with the same key" (or the next after it), an asof join. Events come sorted by time, so a single
+walk over both tables that remembers the latest row of each key is enough (core/matching): some ten
+ns a row.
 """
 
 from collections.abc import Callable
@@ -28,14 +28,16 @@ def _asof(
     rows_of: Callable[..., npt.NDArray[np.uint32]],
     strictly: bool = False,
 ) -> pl.DataFrame:
-    """``left`` with the columns of the matching row of ``right``, else nulls.
+    """Add to each row of ``left`` the columns of the matching row of ``right``, else nulls.
 
-    That is the latest one at or before it (``latest_before``), or the first one at or after it
-    (``first_after``). ``by`` are up to three key columns of integers that both have (none: time
-    alone decides), ``left_on`` and ``right_on`` their time columns. Of rows of ``right`` with the
-    same time the last counts, or the first; ``strictly`` leaves out rows at the very time of the
-    left one. The result is sorted by ``left_on`` and also has ``right_on``. Rows without a time or
-    key match nothing.
+    `latest_before` matches the latest row at or before the left one, `first_after` the first row at
+    or after it. The result is sorted by ``left_on`` and also has the column ``right_on``.
+
+    * ``by``: up to three key columns of integers that both frames have ([]: time alone decides).
+    * ``left_on``, ``right_on``: their time columns. Rows without a time or a key match nothing.
+    * ``strictly``: rows at the very time of the left one do not match.
+
+    Of rows of ``right`` with one time, `latest_before` takes the last, `first_after` the first.
     """
     right = _sorted(right.drop_nulls([*by, right_on]), right_on)
     left = _sorted(left, left_on)
@@ -66,7 +68,7 @@ first_after = partial(_asof, rows_of=_core.first_after)
 def nearest(
     left: pl.DataFrame, right: pl.DataFrame, by: list[str], left_on: str, right_on: str
 ) -> pl.DataFrame:
-    """As :func:`latest_before`, but the row of ``right`` nearest in time, before or after.
+    """Do the same as `latest_before` with the row of ``right`` nearest in time, before or after.
 
     For two events of one constructor whose order differs between versions of a library.
     """
@@ -82,11 +84,11 @@ def nearest(
 
 
 def ends_of_starts(starts: pl.DataFrame, ends: pl.DataFrame) -> pl.Series:
-    """For every row of `callback_start` the row of its `callback_end`, null for none.
+    """Find for each row of `callback_start` the row of its `callback_end`; null: there is none.
 
     Both are sorted by time. An instance ends with the next event of the same callback on the same
-    thread, if that is an end. It may begin in the nanosecond in which the one before ended (end
-    first), or last no time at all (start first): the former when one was open before.
+    thread, if that is an end. An end in the nanosecond of the start is that of the instance before,
+    if one was open; else the instance itself took no time at all.
     """
     key = ["pid", "tid", "callback"]
     return _rows(
@@ -100,7 +102,7 @@ def ends_of_starts(starts: pl.DataFrame, ends: pl.DataFrame) -> pl.Series:
 
 
 def _rows(numbers: npt.NDArray[np.uint32]) -> pl.Series:
-    """Numbers of rows, null for none."""
+    """Make a series of numbers of rows, null for none."""
     index = pl.Series(numbers)
     none = index == _core.NO_ROW
     return index.set(none, None) if none.any() else index
@@ -120,26 +122,28 @@ def _as_array(column: pl.Series) -> npt.NDArray[Any]:
 
 
 def _sorted(frame: pl.DataFrame, time: str) -> pl.DataFrame:
-    # Events come sorted, and looking costs far less time and memory than sorting again.
+    """Sort a frame by time, unless it is sorted."""
+    # Events come sorted, and a test costs far less time and memory than sorting again.
     return frame if frame[time].is_sorted() else frame.sort(time, maintain_order=True)
 
 
 def in_order(frame: pl.DataFrame, time: str, *ties: str, nulls_last: bool = False) -> pl.DataFrame:
-    """``frame`` sorted by ``time`` and ``ties``, if not all times grow: looking is cheap."""
+    """Sort a frame by ``time`` and ``ties``, unless its times grow."""
     if grows(frame[time]):
         return frame
     return frame.sort(time, *ties, nulls_last=nulls_last, maintain_order=True)
 
 
 def grows(times: pl.Series) -> bool:
-    """Whether every time is later than the one before it; nulls say nothing."""
+    """Whether each time is later than the one before it; nulls are ignored."""
     return bool((times.slice(1) > times.head(max(len(times) - 1, 0))).all())
 
 
 def by_number(rows: pl.DataFrame, number: str, column: str, height: int) -> pl.Series:
-    """``column`` of ``rows`` laid out by their ``number``: a series of ``height``, null elsewhere.
+    """Put the values of ``column`` at the places that ``number`` gives in a series of ``height``.
 
-    A left join on a frame's own row numbers. Of several rows with one number the last counts.
+    All other places are null. It is a left join on a frame's own row numbers. Of several rows with
+    one number the last counts.
     """
     values = pl.repeat(None, height, dtype=rows.schema[column], eager=True).alias(column)
     return values.scatter(rows[number], rows[column])

@@ -1,7 +1,7 @@
 """Messages: who published them when, who took them, and which take belongs to which publication.
 
 A message is identified by its topic and its DDS source timestamp (paper, section 2.4). Versions
-of ROS 2 show different halves of that:
+of ROS 2 have different events of that:
 
 * from Jazzy on `rmw_publish` carries the publisher's handle and the source timestamp, and
   `rmw_take` the same timestamp: the match is exact;
@@ -22,8 +22,8 @@ Requests and responses of services are messages, too: a client publishes ``SERVI
 the server takes, and takes ``SERVICE:response``. Instead of a source timestamp they have the number
 of their call (:func:`service_calls`).
 
-Where a thread of its own sends for the executor, `rmw_publish` is recorded when the message is
-handed over; `asynchronous_send` says when, and whether, it was sent.
+An asynchronous publisher hands its messages to a thread that sends them. `rmw_publish` is recorded
+when the message is handed over; `asynchronous_send` says when, and whether, the thread sent it.
 """
 
 from collections.abc import Mapping
@@ -48,43 +48,48 @@ _NO_CALL = pl.lit(None, dtype=pl.Int64)
 _CALLS = {"rmw_send_request": "client", "rmw_take_request": "service"}
 _CALLS |= {"rmw_send_response": "service", "rmw_take_response": "client"}
 _DISPATCHES = ("dispatch_intra_process_subscription_callback", "dispatch_intra_process")
-_COPIES = 3  # so often a message may be copied on its way to a callback of its process
-_CALL_BITS = 40
+_COPIES = 3  # at most: a message is copied on its way to a callback of its process
+_CALL_BITS = 40  # of the number of a call: the client stands above, which of its calls below
 _GID = 16  # bytes that mean anything
 _CLOCKS_AGREE = 2_000
-"""So far apart (ns) the clocks of events and stamps may be; no writer publishes twice meanwhile."""
+"""How far apart (ns) the clocks of events and stamps may be. No writer publishes twice so fast."""
 _HELD_UP = 1_000_000
-"""So long (ns) a message is hardly ever on its way from its event to its stamp."""
+"""The longest time (ns) that is likely between a publication's event and its source timestamp."""
 
 
 def service_calls(
     tables: events.EventTables, objects: Objects, clock_offset_ns: int
 ) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Requests and responses that were sent, and those taken: ``time, pid, tid, rmw_handle, call``.
+    """Return two frames of requests and responses: those that were sent, and those taken.
 
-    ``call`` is the number of a call in the recording: of the client, and which of its calls it is.
-    Servers know clients by their gids.
+    Columns: ``time`` (ns), ``pid``, ``tid``, ``rmw_handle``, and ``call``, a number that identifies
+    the call in the recording: which client, and which of its calls. Servers know clients by gid.
     """
     columns = ["time", "pid", "tid", "rmw_handle"]
     if not any(events.table(tables, name).height for name in _CALLS):
-        none = events.table(tables, "rmw_send_request").rename({"rmw_client_handle": "rmw_handle"})
-        return (none := none.select(*columns, call="sequence_number")), none
-    found = {}
+        no_calls = events.table(tables, "rmw_send_request").rename(
+            {"rmw_client_handle": "rmw_handle"}
+        )
+        no_calls = no_calls.select(*columns, call="sequence_number")
+        return no_calls, no_calls
+    of_event = {}
     for name, role in _CALLS.items():
         rows = events.table(tables, name, ["taken", "source_timestamp"] if "take" in name else [])
         if "taken" in rows.columns:
             rows = rows.filter(pl.col("taken").fill_null(1) != 0)
-        found[name] = rows.rename({f"rmw_{role}_handle": "rmw_handle"})
+        of_event[name] = rows.rename({f"rmw_{role}_handle": "rmw_handle"})
     requests = objects.publishers.filter(pl.col("topic").cast(pl.String).str.ends_with(REQUEST))
     clients = requests.select(*_END, "topic", client="publisher")
     for name in ("rmw_send_request", "rmw_take_response"):
-        found[name] = latest_before(found[name], clients, ["pid", "rmw_handle"], "time", "created")
-    owners = _gid_owners(tables, objects, found, clients, clock_offset_ns)
+        of_event[name] = latest_before(
+            of_event[name], clients, ["pid", "rmw_handle"], "time", "created"
+        )
+    owners = _gid_owners(tables, objects, of_event, clients, clock_offset_ns)
     for name in ("rmw_take_request", "rmw_send_response"):
-        rows = found[name].with_columns(gid=_gid_text("client_gid"))
-        found[name] = rows.join(owners, on="gid", how="left", maintain_order="left")
+        rows = of_event[name].with_columns(gid=_gid_text("client_gid"))
+        of_event[name] = rows.join(owners, on="gid", how="left", maintain_order="left")
     number = pl.col("client").cast(pl.Int64) * (1 << _CALL_BITS) + pl.col("sequence_number")
-    calls = {name: rows.select(*columns, call=number) for name, rows in found.items()}
+    calls = {name: rows.select(*columns, call=number) for name, rows in of_event.items()}
     sent, taken = ([calls[name] for name in _CALLS if way in name] for way in ("send", "take"))
     return pl.concat(sent), pl.concat(taken)
 
@@ -92,63 +97,67 @@ def service_calls(
 def _gid_owners(
     tables: events.EventTables,
     objects: Objects,
-    found: Mapping[str, pl.DataFrame],
+    of_event: Mapping[str, pl.DataFrame],
     clients: pl.DataFrame,
     clock_offset_ns: int,
 ) -> pl.DataFrame:
-    """``client, gid``: which client has which gid.
+    """Make a frame of which ``client`` has which ``gid``.
 
-    `rmw_client_init` says so. Else it is the client that sent the latest request of the same number
-    to the service before the source timestamp of the one taken, in most of the gid's calls.
+    `rmw_client_init` says so. Without it, each request that a server took votes: for the client
+    that sent the latest request with the same number to this service before the source timestamp.
+    The client with most votes has the gid.
     """
     key = ["pid", "rmw_handle"]
     created = events.table(tables, "rmw_client_init").rename({"rmw_client_handle": "rmw_handle"})
     created = first_after(created, clients, key, "time", "created")
     servers = objects.subscriptions.select(*_END, "topic")
-    came = latest_before(found["rmw_take_request"], servers, key, "time", "created")
+    came = latest_before(of_event["rmw_take_request"], servers, key, "time", "created")
     at = pl.min_horizontal(pl.col("source_timestamp") - clock_offset_ns, "time")
-    came = came.with_columns(at=at)  # the wall clock may be moved: it was sent before it was taken
-    sent = found["rmw_send_request"].select("topic", "sequence_number", "client", sent="time")
+    came = came.with_columns(at=at)  # at the latest when it was taken, if the wall clock was set
+    sent = of_event["rmw_send_request"].select("topic", "sequence_number", "client", sent="time")
     came = latest_before(came, sent, ["topic", "sequence_number"], "at", "sent")
     votes = came.group_by("client", "client_gid").len().sort("len", descending=True)
-    named = created.select("client", gid=_gid_text("gid"))
-    owners = pl.concat([named, votes.select("client", gid=_gid_text("client_gid"))])
+    by_init = created.select("client", gid=_gid_text("gid"))
+    owners = pl.concat([by_init, votes.select("client", gid=_gid_text("client_gid"))])
     return owners.drop_nulls().unique("gid", keep="first", maintain_order=True)
 
 
 def _gid_text(column: str) -> pl.Expr:
-    """A gid as a text, which can be a key."""
+    """A gid as text, so that frames can be joined by it."""
     return pl.col(column).list.head(_GID).cast(pl.List(pl.String)).list.join(".")
 
 
 def publications(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) -> pl.DataFrame:
-    """All publications of known publishers, sorted by time.
+    """Make a frame of all publications of known publishers, sorted by time. Columns:
 
-    Columns: ``publication`` (numbered from 0), ``time`` (of `rmw_publish`, the write to DDS; of
-    the `rclcpp_intra_publish` when there was no such write), ``pid``, ``tid``, ``publisher``,
-    ``node``, ``topic``, ``source_timestamp`` (CLOCK_REALTIME, null if unknown), ``call`` (of a
-    request or response, null for messages; absent where no service was called) and ``intra_time``
-    (when it was handed to ring buffers of the same process, null if it was not).
+    * ``publication``: numbered from 0.
+    * ``time``: of `rmw_publish`, the write to DDS; without one, of `rclcpp_intra_publish` (ns).
+    * ``pid``, ``tid``, ``publisher``, ``node``, ``topic``.
+    * ``source_timestamp``: ns of CLOCK_REALTIME; null if unknown.
+    * ``call``: of a request or response, null for messages; absent where no service was called.
+    * ``intra_time``: when it was handed to ring buffers of the same process (ns); null if never.
     """
     written = _written(tables, objects, calls)
     handed = _handed_over(tables, objects)
-    every = written.with_columns(intra_time=_NO_TIME)
+    all_publications = written.with_columns(intra_time=_NO_TIME)
     if handed.height:
         # One publish() may do both, ring buffers first: the next write by the same publisher on
         # the same thread is the same message.
         both = latest_before(written, handed, ["pid", "tid", "publisher"], "time", "intra_time")
-        first = pl.col("handed").is_first_distinct() & pl.col("handed").is_not_null()
-        both = both.with_columns(pl.when(first).then("intra_time"))
+        first_write = pl.col("handed").is_first_distinct() & pl.col("handed").is_not_null()
+        both = both.with_columns(pl.when(first_write).then("intra_time"))
         alone = handed.join(both.drop_nulls("intra_time"), on="handed", how="anti")
         alone = alone.with_columns(time="intra_time", source_timestamp=_NO_TIME, call=_NO_CALL)
-        every = pl.concat([one.select(every.columns) for one in (both, alone)])
-    return in_order(every, "time", "pid", "tid").with_row_index("publication")
+        all_publications = pl.concat(
+            [part.select(all_publications.columns) for part in (both, alone)]
+        )
+    return in_order(all_publications, "time", "pid", "tid").with_row_index("publication")
 
 
 def _written(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) -> pl.DataFrame:
-    """Messages given to DDS: ``time, pid, tid, publisher, node, topic, source_timestamp``.
+    """Make a frame of the messages given to DDS, with the columns of :func:`publications`.
 
-    And ``call``, where services were called.
+    Without ``publication`` and ``intra_time``; with ``call`` only where services were called.
     """
     writes = _writes(tables)
     if calls.height:
@@ -156,7 +165,7 @@ def _written(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) 
     by_rmw = objects.publishers.select(*_END, *_PUBLISHER)
     nameless = pl.col("rmw_handle").is_null()
     known = writes.filter(~nameless)
-    found = [latest_before(known, by_rmw, ["pid", "rmw_handle"], "time", "created")]
+    parts = [latest_before(known, by_rmw, ["pid", "rmw_handle"], "time", "created")]
     if known.height < writes.height:
         # The publisher is that of the rcl_publish of the same message just before. Addresses of
         # messages repeat, so a rcl_publish counts for the first write after it only.
@@ -166,15 +175,18 @@ def _written(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) 
         rows = latest_before(writes.filter(nameless), published, message, "time", "published")
         again = pl.col("rcl") == pl.col("rcl").shift(1).over(message)
         rows = rows.with_columns(pl.when(~again.fill_null(False)).then("publisher_handle"))
-        found.append(_by_rcl_handle(rows, objects, "time"))
+        parts.append(_by_rcl_handle(rows, objects, "time"))
     columns = ["time", "pid", "tid", *_PUBLISHER, "source_timestamp"]
     if calls.height:
         columns.append("call")
-    every = pl.concat([frame.select(columns) for frame in found])
-    return every.drop_nulls("publisher") if every["publisher"].null_count() else every
+    all_writes = pl.concat([frame.select(columns) for frame in parts])
+    return (
+        all_writes.drop_nulls("publisher") if all_writes["publisher"].null_count() else all_writes
+    )
 
 
 def _by_rcl_handle(rows: pl.DataFrame, objects: Objects, time: str) -> pl.DataFrame:
+    """Add the publisher that had the row's ``publisher_handle`` at the instant ``time``."""
     publishers = objects.publishers.select(
         "pid", *_PUBLISHER, publisher_handle="handle", created="valid_from"
     )
@@ -182,7 +194,10 @@ def _by_rcl_handle(rows: pl.DataFrame, objects: Objects, time: str) -> pl.DataFr
 
 
 def _writes(tables: events.EventTables) -> pl.DataFrame:
-    """The event that stands for writing to DDS in this recording, with what it says."""
+    """Make a frame of the event that stands for writing to DDS in this recording.
+
+    Columns: ``time, pid, tid, message, rmw_handle, source_timestamp``; nulls where it has none.
+    """
     names = ("rmw_publish", "dds_write", "rcl_publish")
     name = next((name for name in names if events.table(tables, name).height), names[-1])
     if name == "rmw_publish":
@@ -199,21 +214,26 @@ def _writes(tables: events.EventTables) -> pl.DataFrame:
         bound = bound.select("pid", "tid", "source_stamp", message="addr", bound="time")
         writes = first_after(writes, bound, message, "time", "bound")
         # A later write of the same address has a better claim to the stamp after it.
-        other = pl.col("bound") == pl.col("bound").shift(-1).over(message)
-        stamp = pl.when(~other.fill_null(False)).then("source_stamp")
+        later_write = pl.col("bound") == pl.col("bound").shift(-1).over(message)
+        stamp = pl.when(~later_write.fill_null(False)).then("source_stamp")
         writes = writes.with_columns(pl.coalesce("source_timestamp", stamp))
     return writes.select("time", "pid", "tid", "message", "rmw_handle", "source_timestamp")
 
 
 def _handed_over(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
-    """Messages given to ring buffers: ``handed, intra_time, pid, tid, publisher, node, topic``."""
+    """Make a frame of the messages given to ring buffers, numbered by ``handed``.
+
+    Further columns: ``intra_time`` (ns), ``pid``, ``tid``, ``publisher``, ``node``, ``topic``.
+    """
     handed = events.table(tables, "rclcpp_intra_publish").rename({"time": "intra_time"})
-    found = _by_rcl_handle(handed, objects, "intra_time").drop_nulls("publisher")
-    return found.with_row_index("handed").select("handed", "intra_time", "pid", "tid", *_PUBLISHER)
+    of_known = _by_rcl_handle(handed, objects, "intra_time").drop_nulls("publisher")
+    return of_known.with_row_index("handed").select(
+        "handed", "intra_time", "pid", "tid", *_PUBLISHER
+    )
 
 
 def taken_by_rmw(tables: events.EventTables) -> pl.DataFrame:
-    """The events ``rmw_take`` that found a message."""
+    """The rows of `rmw_take` in which a message was there to be taken."""
     taken = events.table(tables, "rmw_take", ["taken"])
     if (taken["taken"] == 0).any():
         taken = taken.filter(pl.col("taken").fill_null(1) != 0)
@@ -221,13 +241,19 @@ def taken_by_rmw(tables: events.EventTables) -> pl.DataFrame:
 
 
 def takes(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) -> pl.DataFrame:
-    """All messages taken by known subscriptions, sorted by time.
+    """Make a frame of all messages that known subscriptions took, sorted by time. Columns:
 
-    Columns: ``take`` (numbered from 0), ``time``, ``pid``, ``tid``, ``callback_id`` (null if the
-    subscription has no callback), ``node``, ``topic``, ``source_timestamp``, ``call`` (of a request
-    or response, null for messages; absent where no service was called), ``intra_process``, and for
-    those the ``buffer`` and ``index`` the message lay in (null where CARET's events tell of
-    them). A take that found nothing (``taken`` = 0) carries no message and is left out.
+    * ``take``: numbered from 0.
+    * ``time`` (ns), ``pid``, ``tid``.
+    * ``callback_id``: null if the subscription has no callback.
+    * ``node``, ``topic``.
+    * ``source_timestamp``: ns of CLOCK_REALTIME; null if unknown.
+    * ``call``: of a request or response, null for messages; absent where no service was called.
+    * ``intra_process``: whether it came from within the process.
+    * ``buffer``, ``index``: the ring buffer, and the place in it, where such a message lay; null
+      where only CARET's events show it.
+
+    A take that got no message (``taken`` = 0) is left out.
     """
     types = {name: objects.subscriptions.schema[name] for name in ("node", "topic")}
     callbacks = objects.callbacks.cast(types)  # type: ignore[arg-type]
@@ -268,21 +294,23 @@ def takes(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) -> 
         )
         for part in parts
     ]
-    every = pl.concat([part for part in parts if part.height] or parts[:1])
-    every = every.drop_nulls("topic") if every["topic"].null_count() else every
-    return in_order(every, "time", "pid", "tid").with_row_index("take")
+    all_takes = pl.concat([part for part in parts if part.height] or parts[:1])
+    all_takes = all_takes.drop_nulls("topic") if all_takes["topic"].null_count() else all_takes
+    return in_order(all_takes, "time", "pid", "tid").with_row_index("take")
 
 
 def _dispatched(tables: events.EventTables) -> pl.DataFrame:
     """CARET's dispatches of messages within a process: ``time, pid, tid, message, callback``.
 
-    None where ring buffers' events tell of the same messages.
+    The frame is empty where events of ring buffers show the same messages.
     """
     rows = [events.table(tables, name) for name in _DISPATCHES]
     if events.table(tables, "rclcpp_ring_buffer_dequeue").height:
         rows = [row.clear() for row in rows]
-    every = pl.concat(row.select("time", "pid", "tid", "message", "callback") for row in rows)
-    return in_order(every, "time")
+    all_dispatches = pl.concat(
+        row.select("time", "pid", "tid", "message", "callback") for row in rows
+    )
+    return in_order(all_dispatches, "time")
 
 
 def has_stampless(published: pl.DataFrame) -> bool:
@@ -293,17 +321,18 @@ def has_stampless(published: pl.DataFrame) -> bool:
 def link_takes(
     tables: events.EventTables, taken: pl.DataFrame, published: pl.DataFrame, clock_offset_ns: int
 ) -> tuple[pl.DataFrame, StampedMessages | None]:
-    """``taken`` with a column ``publication``: which publication each take read (null: unknown).
+    """Add the column ``publication``: which publication each take read (null: unknown).
 
-    ``clock_offset_ns`` is what to add to event times for CLOCK_REALTIME, the clock of source
-    timestamps, when the recording began; it is used only where publications carry no source
-    timestamp. Also returns what was found there, if the clocks' distance alone did not tell.
+    ``clock_offset_ns`` is CLOCK_REALTIME, the clock of source timestamps, less the clock of events
+    when the recording began. It is used only where publications carry no source timestamp. The
+    second value is how such messages were found where a fixed distance of the clocks did not
+    suffice, else None.
     """
-    found = _with_same(taken, published, "source_timestamp")
+    matches = _with_same(taken, published, "source_timestamp")
     if "call" in taken.columns and "call" in published.columns:
-        found = pl.concat([found, _with_same(taken, published, "call")])
-    linked = taken.with_columns(by_number(found, "take", "publication", taken.height))
-    columns, followed = linked.columns, None
+        matches = pl.concat([matches, _with_same(taken, published, "call")])
+    linked = taken.with_columns(by_number(matches, "take", "publication", taken.height))
+    columns, by_clocks = linked.columns, None
     through_buffer = pl.col("intra_time").is_not_null() & (pl.col("time") <= pl.col("intra_time"))
     stampless = _messages(published).filter(pl.col("source_timestamp").is_null() & ~through_buffer)
     unknown = linked.filter(pl.col("publication").is_null() & (pl.col("source_timestamp") > 0))
@@ -312,9 +341,9 @@ def link_takes(
         rows = _by_fixed_clocks(unknown, stampless, clock_offset_ns)
         if rows is None:
             stampless = stampless.rename({"guess": "publication"})
-            followed = messages_of_stamps(unknown, stampless, clock_offset_ns)
+            by_clocks = messages_of_stamps(unknown, stampless, clock_offset_ns)
             message = ["topic", "source_timestamp"]
-            guesses = followed.frame.rename({"publication": "guess"})
+            guesses = by_clocks.frame.rename({"publication": "guess"})
             rows = unknown.join(guesses, on=message, how="left", maintain_order="left")
         guess = by_number(rows, "take", "guess", linked.height)
         linked = linked.with_columns(pl.coalesce("publication", guess))
@@ -324,18 +353,21 @@ def link_takes(
         stored = _enqueued(tables, published)
         rows = latest_before(linked, stored, ["pid", "buffer", "index"], "time", "enqueued")
         linked = rows.with_columns(pl.coalesce("publication", "stored")).sort("take")
-    return linked.select(columns), followed
+    return linked.select(columns), by_clocks
 
 
 def _by_fixed_clocks(
     unknown: pl.DataFrame, stampless: pl.DataFrame, clock_offset_ns: int
 ) -> pl.DataFrame | None:
-    """``unknown`` takes with the latest publication before their stamps as ``guess``; None where
-    the clocks did not keep their distance, or a message's publication is not there."""
+    """Add to takes the column ``guess``: the latest publication before their source timestamp.
+
+    None: the distance of the clocks changed, or the publication of a message is missing.
+    """
     sent = pl.col("source_timestamp") - clock_offset_ns + _CLOCKS_AGREE
     known = stampless.select("topic", "guess", published="time")
     rows = latest_before(unknown.with_columns(sent=sent), known, ["topic"], "sent", "published")
-    # A subscription gets a message once: a second take of it read one whose events were lost.
+    # A subscription gets a message once. So a second take with the same guess read another message,
+    # whose publication is missing.
     again = pl.col("guess") == pl.col("guess").shift(1).over("pid", "node", "callback_id")
     late = pl.col("sent") - pl.col("published") > _CLOCKS_AGREE + _HELD_UP
     early = pl.col("published") > pl.col("time")
@@ -346,9 +378,10 @@ def _by_fixed_clocks(
 def _with_dispatched(
     tables: events.EventTables, linked: pl.DataFrame, published: pl.DataFrame
 ) -> pl.DataFrame:
-    """``linked`` with the publications of messages that CARET saw dispatched in their process.
+    """Add the publications of messages that CARET saw dispatched within their process.
 
-    Addresses are used again: a message is the latest one handed over, or copied, at its address.
+    Addresses are used again: the message at an address is the latest that was handed over, or
+    copied, there.
     """
     address, thread = ["pid", "message"], ["pid", "tid"]
     handed = events.table(tables, "rclcpp_intra_publish").select("time", *thread, "message")
@@ -368,36 +401,41 @@ def _with_dispatched(
     rows = linked.filter(pl.col("intra_process") & pl.col("buffer").is_null())
     rows = latest_before(rows, took, thread, "time", "dispatched")
     rows = latest_before(rows, origins, address, "time", "since").drop_nulls("stored")
-    # A callback gets a message once: the second time it is one whose events were lost.
+    # A callback gets a message once: the second dispatch was of a message whose events were lost.
     rows = rows.unique(["callback_id", "stored"], keep="first", maintain_order=True)
     stored = by_number(rows, "take", "stored", linked.height)
     return linked.with_columns(pl.coalesce("publication", stored))
 
 
 def _messages(published: pl.DataFrame) -> pl.DataFrame:
-    """The publications that are no requests and responses of services."""
+    """The publications without the requests and responses of services."""
     return published.filter(pl.col("call").is_null()) if "call" in published.columns else published
 
 
 def _with_same(taken: pl.DataFrame, published: pl.DataFrame, stamp: str) -> pl.DataFrame:
-    """``take, publication`` that agree in topic and in the column ``stamp``.
+    """Make a frame of the pairs ``take, publication`` with the same topic and the same ``stamp``.
 
-    An asof join that insists on equality: unlike a hash join it stays linear in time and memory
-    whatever the stamps are. Should two publications of a topic share one, the first is taken.
+    ``stamp`` is the name of a column. An asof join, and then a test for equality: unlike a hash
+    join it stays linear in time and memory whatever the stamps are. Of two publications of a topic
+    with one stamp the first counts.
     """
     wanted = taken.select("topic", stamp, "take")
     wanted = wanted.drop_nulls(stamp) if wanted[stamp].null_count() else wanted
     stamped = published.select("topic", "publication", stamped=stamp)
     stamped = stamped.drop_nulls("stamped") if stamped["stamped"].null_count() else stamped
-    if not grows(stamped["stamped"]):  # among equals the first comes last
+    if not grows(stamped["stamped"]):  # the join takes the last of equal stamps
         stamped = stamped.reverse().sort("stamped", maintain_order=True)
-    found = latest_before(wanted, stamped, ["topic"], stamp, "stamped")
-    return found.filter(pl.col(stamp) == pl.col("stamped")).select("take", "publication")
+    latest = latest_before(wanted, stamped, ["topic"], stamp, "stamped")
+    return latest.filter(pl.col(stamp) == pl.col("stamped")).select("take", "publication")
 
 
 def _enqueued(tables: events.EventTables, published: pl.DataFrame) -> pl.DataFrame:
-    """Every enqueue into a ring buffer: ``pid, buffer, index, enqueued, stored, overwrites``: the
-    publication that was put there, and whether the message that lay in this place was lost."""
+    """Make a frame of every enqueue into a ring buffer.
+
+    Columns: ``pid``, ``tid``, ``buffer``; ``index``, the place in the buffer; ``enqueued``, when
+    (ns); ``stored``, the publication that was put there (null: unknown); ``overwrites``, whether
+    the message that lay in this place was lost.
+    """
     handed = published.drop_nulls("intra_time").select(
         "pid", "tid", "intra_time", stored="publication"
     )
@@ -412,7 +450,7 @@ def _enqueued(tables: events.EventTables, published: pl.DataFrame) -> pl.DataFra
 def overwritten_in(
     tables: events.EventTables, published: pl.DataFrame, buffers: pl.DataFrame, callback_id: int
 ) -> pl.Series:
-    """Publications that were overwritten in the ring buffers of one subscription's callback."""
+    """Numbers of the publications that were overwritten in the ring buffers of a callback."""
     stored = _enqueued(tables, published)
     stored = latest_before(stored, buffers, ["pid", "buffer"], "enqueued", "valid_from")
     stored = stored.filter(pl.col("callback_id") == callback_id)
@@ -423,7 +461,7 @@ def overwritten_in(
 def with_departures(
     published: pl.DataFrame, tables: events.EventTables, objects: Objects
 ) -> pl.DataFrame:
-    """``published`` with a column ``sent``: when each message left (null: it never did)."""
+    """Add the column ``sent``: when each message left its process (ns, null: it never did)."""
     created = events.table(tables, "rcl_publisher_init", ["asynchronous"])
     created = created.filter(pl.col("asynchronous").fill_null(0) != 0)
     if not created.height:
@@ -440,13 +478,13 @@ def with_departures(
 def why_not_sent(
     published: pl.DataFrame, tables: events.EventTables, objects: Objects
 ) -> pl.Series:
-    """Per publication the reason why it was not sent; only of use for those without ``sent``."""
+    """Give each publication a reason why it was not sent; it holds for those without ``sent``."""
     sends = _sends(published, tables, objects).with_columns(reason=pl.lit("discarded"))
     return by_number(sends, "publication", "reason", published.height).fill_null("not sent")
 
 
 def _sends(published: pl.DataFrame, tables: events.EventTables, objects: Objects) -> pl.DataFrame:
-    """``publication, time, outcome`` of what publisher threads dealt with."""
+    """The table `asynchronous_send` with the ``publication`` that each row is about."""
     publishers = objects.publishers.select("pid", "publisher", rmw_publisher_handle="rmw_handle")
     sends = events.table(tables, "asynchronous_send").rename({"timestamp": "source_timestamp"})
     stamped = published.select("publication", "publisher", "source_timestamp")
@@ -457,22 +495,23 @@ def _sends(published: pl.DataFrame, tables: events.EventTables, objects: Objects
 def discarded_instances(
     taken: pl.DataFrame, tables: events.EventTables, objects: Objects, instances: pl.DataFrame
 ) -> pl.Series:
-    """Per callback instance whether it was a gate's that discarded its message (else null)."""
+    """Give each callback instance true if it is a gate's that discarded its message, else null."""
     key = ["callback_id", "source_timestamp"]
     discarded = gate_decisions(tables, objects).filter(pl.col("release").is_null())
     stamped = taken.drop_nulls("instance").join(discarded, on=key, how="semi")
     within = instances.join(discarded, on=["callback_id", "start"], how="semi")
-    found = pl.concat([one.select("instance") for one in (stamped, within)])
-    found = found.with_columns(discarded=pl.lit(True))
-    return by_number(found, "instance", "discarded", instances.height)
+    all_discarding = pl.concat([rows.select("instance") for rows in (stamped, within)])
+    all_discarding = all_discarding.with_columns(discarded=pl.lit(True))
+    return by_number(all_discarding, "instance", "discarded", instances.height)
 
 
 def gate_decisions(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     """The table `gate_release` with the ``callback_id`` of each gate.
 
-    A shaping node in ROS 2 does not know its callback's handle. A decision of its is there once for
-    each subscription of its process; which one took the message, the source timestamp tells. About
-    a message without one it was made in an instance on its thread, which began at ``start``.
+    A shaping node in ROS 2 does not know the handle of its callback. So a decision of its gate has
+    a row for each subscription of its process, and the message's source timestamp decides later
+    which of them took it. A decision about a message without such a stamp was made in the instance
+    that ran on the gate's thread; that began at ``start`` (null for all others).
     """
     decisions = events.table(tables, "gate_release", ["mode", "moved", "dropped"])
     key = ["pid", "callback"]
@@ -489,13 +528,13 @@ def gate_decisions(tables: events.EventTables, objects: Objects) -> pl.DataFrame
     listening = callbacks.filter(pl.col("kind") == "subscription").select("pid", "callback_id")
     unknown = nameless.filter(stamped).with_columns(start=_NO_TIME)
     unknown = unknown.join(listening.unique(), on="pid", maintain_order="left")
-    return pl.concat([known, *(one.select(known.columns) for one in (unknown, within))])
+    return pl.concat([known, *(rows.select(known.columns) for rows in (unknown, within))])
 
 
 def with_overrun(decisions: pl.DataFrame, due_cycles: int = 0) -> pl.DataFrame:
-    """Decisions with the column ``overrun``, which older recordings lack.
+    """Add the column ``overrun``, if an older recording lacks it.
 
-    Without it a message overran when it left in a later cycle than ``due_cycles`` after its own.
+    Then a message overran if it left more than ``due_cycles`` cycles after its own.
     """
     if "overrun" in decisions.columns:
         return decisions
@@ -506,12 +545,13 @@ def with_overrun(decisions: pl.DataFrame, due_cycles: int = 0) -> pl.DataFrame:
 def gated_hops(
     tables: events.EventTables, objects: Objects, hops: pl.DataFrame, due_cycles: int = 0
 ) -> pl.DataFrame:
-    """What gates decided about the messages of a chain: one row per hop whose callback is a gate.
+    """Make a frame of what gates decided: a row per hop of a traversal whose callback is a gate.
 
-    ``traversal, hop, arrival, origin, release, let_go, slot, cycles_waited, anchor, overrun, mode,
-    dropped, moved_ns`` of `gate_release`, sorted; ``let_go`` is when it did. Several messages may
-    have the same source timestamp (writers stamp in microseconds, a simulated clock stands still):
-    then the decision is meant whose ``arrival`` is nearest to the start of the callback.
+    Columns, sorted by the first two: ``traversal``; ``hop``; ``let_go``, when the gate let the
+    message go (ns); and of `gate_release`: ``arrival, origin, release, slot, cycles_waited, anchor,
+    overrun, mode, dropped, moved_ns``. Several messages may have the same source timestamp (writers
+    stamp in microseconds, a simulated clock stands still): then the decision counts whose
+    ``arrival`` is nearest to the start of the callback.
     """
     key = ["callback_id", "source_timestamp"]
     decided = with_overrun(gate_decisions(tables, objects), due_cycles).with_columns(let_go="time")
@@ -519,10 +559,10 @@ def gated_hops(
     columns = [*reached.columns, *(n for n in decided.columns if n not in reached.columns)]
     stamped = reached.drop_nulls(key).join(decided.drop("start"), on=key)
     within = reached.drop("source_timestamp").join(decided, on=["callback_id", "start"])
-    found = pl.concat([one.select(columns) for one in (stamped, within)])
+    candidates = pl.concat([rows.select(columns) for rows in (stamped, within)])
     apart = (pl.col("arrival") - pl.col("start")).abs()
-    found = found.sort("traversal", "hop", apart, maintain_order=True)
-    return found.unique(["traversal", "hop"], keep="first", maintain_order=True).select(
+    candidates = candidates.sort("traversal", "hop", apart, maintain_order=True)
+    return candidates.unique(["traversal", "hop"], keep="first", maintain_order=True).select(
         *("traversal", "hop", "arrival", "origin", "release", "let_go", "slot"),
         *("cycles_waited", "anchor", "overrun", "mode", "dropped"),
         moved_ns=pl.col("moved").fill_null(0),

@@ -1,10 +1,10 @@
 """Who exists: nodes, publishers, subscriptions, timers, services and their callbacks.
 
 Events name objects by handles: addresses that are unique only within one process, and only until
-they are freed. So a handle is looked up as (process, handle, time): the object created there last,
-at or before the event. Handles that were never initialised belong to no object: such are those of
-`ros_discovery_info` (Cyclone DDS), and of everything that existed before tracing began. The order
-of the events is that of rclcpp's constructors (ros2_tracing).
+they are freed. So a handle is looked up as (process, handle, time): it means the last object that
+was created there, at or before the event. A handle without an event of its creation belongs to no
+known object: Cyclone DDS has such for `ros_discovery_info`, and so has all that existed before
+tracing began. The order of the events is that of rclcpp's constructors (ros2_tracing).
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_SERVICES, REQUEST, RESPONSE
 
 _CALL = ("request", "response")
-_NEARLY_ALWAYS = 0.9
+_NEARLY_ALWAYS = 0.9  # of a callback's starts: so many must come behind a take of its subscription
 
 CALLBACK_SCHEMA: dict[str, pl.DataType] = {
     "callback_id": pl.UInt32(),
@@ -39,22 +39,36 @@ CALLBACK_SCHEMA: dict[str, pl.DataType] = {
 class Objects:
     """The objects of a recording, one frame per kind; times are ns of the event clock.
 
-    * ``nodes``: ``pid, handle, valid_from, node`` (name with namespace, ``/front/filter``).
-    * ``publishers``: ``publisher, pid, handle, rmw_handle, valid_from, node, topic``, and
-      ``subscriptions`` likewise. In these two, and in everything joined from them, names are of
-      type ``Enum``: millions of rows carry them as numbers. Clients and servers whose calls were
-      seen are in both, with the topics ``SERVICE:request`` and ``SERVICE:response``.
-    * ``callbacks``: :data:`CALLBACK_SCHEMA`, one row per *registration*, the address
-      (``pid, handle``) under which a callback ran from ``valid_from`` until that address was
-      registered again (``valid_to``, null: never). ``callback_id`` numbers callbacks from 0
-      (:func:`numbered`). ``topic`` is the topic or the service's name. ``declared_ns`` is the
-      period with which a timer was created, ``period_ns`` the same here, and in a
-      :class:`~chainshaper.analysis.flow.DataFlow` the one its starts show. ``observed`` is false
-      for what emits no callback events: subscriptions, services and timers of rclpy, services of
-      actions, and all clients.
-    * ``buffers``: ``pid, buffer, valid_from, callback_id``: intra-process ring buffers.
-    * ``activity``: ``time, pid, node, active``: when lifecycle nodes became active, or inactive.
-    * ``notes``: what cannot be known from this recording, in plain words.
+    ``nodes``
+        ``pid, handle, valid_from, node`` (name with namespace, ``/front/filter``).
+    ``publishers``, ``subscriptions``
+        ``publisher`` or ``subscription`` (numbered from 0), ``pid, handle, rmw_handle, valid_from,
+        node, topic``. In these two, and in all that is joined from them, names are of type
+        ``Enum``: millions of rows carry them as numbers. Clients and servers whose calls were seen
+        are in both, with the topics ``SERVICE:request`` and ``SERVICE:response``.
+    ``callbacks``
+        One row per *registration*: an address under which a callback ran for a time.
+
+        * ``callback_id``: callbacks are numbered from 0 (:func:`numbered`).
+        * ``pid``, ``handle``: process and address.
+        * ``valid_from``, ``valid_to``: from its registration until another one of the same address
+          (null: there was none).
+        * ``kind``: ``timer``, ``subscription``, ``service``, ``client`` or ``unknown``.
+        * ``node``.
+        * ``topic``: the topic's or the service's name.
+        * ``declared_ns``: the period with which a timer was created.
+        * ``period_ns``: the same here; in a :class:`~chainshaper.analysis.flow.DataFlow` the period
+          that its starts show.
+        * ``symbol``: the name of its function.
+        * ``observed``: false for what has no callback events: subscriptions, services and timers of
+          rclpy, services of actions, and all clients.
+        * ``subscription``: its number in that frame.
+    ``buffers``
+        Ring buffers for messages within a process: ``pid, buffer, valid_from, callback_id``.
+    ``activity``
+        When lifecycle nodes became active, or inactive: ``time, pid, node, active``.
+    ``notes``
+        What cannot be known from this recording, in plain words.
     """
 
     nodes: pl.DataFrame
@@ -70,16 +84,16 @@ def resolve_objects(tables: events.EventTables) -> Objects:
     """Find all objects of a recording. Cost is linear in the number of events."""
     nodes, ends = named_nodes(tables), endpoints(tables)
     publishers, subscriptions = (_carrying(tables, ends, k) for k in ("publisher", "subscription"))
-    found = [
+    with_events = [
         _subscription_callbacks(tables, subscriptions),
         _timer_callbacks(tables, nodes),
         _service_callbacks(tables, ends, subscriptions),
     ]
-    registered = pl.concat(found, how="diagonal_relaxed")
+    registered = pl.concat(with_events, how="diagonal_relaxed")
     unknown = _unregistered(tables, registered)
-    told = _told_by_takes(tables, subscriptions, unknown)
-    unknown = unknown.join(told, on=["pid", "handle"], how="anti", maintain_order="left")
-    registered = _with_symbols(tables, pl.concat([registered, told], how="diagonal_relaxed"))
+    by_takes = _subscriptions_by_takes(tables, subscriptions, unknown)
+    unknown = unknown.join(by_takes, on=["pid", "handle"], how="anti", maintain_order="left")
+    registered = _with_symbols(tables, pl.concat([registered, by_takes], how="diagonal_relaxed"))
     # No version of rclcpp says when the callbacks of clients run.
     clients = (
         ends.filter(role="client")
@@ -88,13 +102,15 @@ def resolve_objects(tables: events.EventTables) -> Objects:
     )
     clients = _listening(clients, subscriptions, RESPONSE)
     listening = pl.concat([registered, clients], how="diagonal_relaxed")
-    others = [
+    without_registration = [
         unknown,
         _callbackless(tables, subscriptions, listening),
         _timers_of_python(tables, nodes),
         clients,
     ]
-    callbacks = numbered(tables, pl.concat([registered, *others], how="diagonal_relaxed"))
+    callbacks = numbered(
+        tables, pl.concat([registered, *without_registration], how="diagonal_relaxed")
+    )
     names = []
     for column in ("node", "topic"):
         known = [frame[column].cast(pl.String) for frame in (publishers, subscriptions, callbacks)]
@@ -108,7 +124,7 @@ def resolve_objects(tables: events.EventTables) -> Objects:
         ),
         buffers=_buffers(tables, callbacks),
         activity=_activity(tables, nodes),
-        notes=(*_notes(tables, callbacks), *_notes_of_told(told)),
+        notes=(*_notes(tables, callbacks), *_notes_of_takes(by_takes)),
     )
 
 
@@ -119,47 +135,57 @@ def named_nodes(tables: events.EventTables) -> pl.DataFrame:
 
 
 def _with_node(objects: pl.DataFrame, nodes: pl.DataFrame, at: str) -> pl.DataFrame:
-    """Add ``node`` from ``node_handle`` at time ``at``. Before Iron a node's /rosout publisher is
-    created just before `rcl_node_init`: it belongs to the next node with that handle."""
+    """Add ``node``: the name of the node that had the row's ``node_handle`` at the instant ``at``.
+
+    Before Iron a node's publisher of /rosout is created just before its `rcl_node_init`: if no node
+    had the handle yet, it is the next one that gets it.
+    """
     of_node = nodes.select("pid", "node", node_handle="handle", node_from="valid_from")
-    found = latest_before(objects, of_node, ["pid", "node_handle"], at, "node_from")
+    joined = latest_before(objects, of_node, ["pid", "node_handle"], at, "node_from")
     later = first_after(objects, of_node, ["pid", "node_handle"], at, "node_from")
-    return found.with_columns(pl.col("node").fill_null(later["node"]))
+    return joined.with_columns(pl.col("node").fill_null(later["node"]))
 
 
 def endpoints(tables: events.EventTables) -> pl.DataFrame:
-    """Publishers, subscriptions, clients and services by ``role``, with the columns of the first;
-    the ``topic`` of the last two is the service's name.
+    """Make a frame of all publishers, subscriptions, clients and services.
+
+    Columns: ``role`` (``publisher``, ``subscription``, ``client``, ``service``), ``pid``,
+    ``handle``, ``rmw_handle``, ``valid_from``, ``node``, and ``topic`` (or the service's name).
     """
-    found = []
+    of_roles = []
     for role in ("publisher", "subscription", "client", "service"):
         name = "topic_name" if role in ("publisher", "subscription") else "service_name"
         handles = {"handle": f"{role}_handle", "rmw_handle": f"rmw_{role}_handle"}
-        found.append(
+        of_roles.append(
             events.table(tables, f"rcl_{role}_init").select(
                 "pid", "node_handle", **handles, role=pl.lit(role), valid_from="time", topic=name
             )
         )
-    ends = _with_node(pl.concat(found), named_nodes(tables), "valid_from")
+    ends = _with_node(pl.concat(of_roles), named_nodes(tables), "valid_from")
     return ends.drop("node_handle", "node_from")
 
 
 def _carrying(tables: events.EventTables, ends: pl.DataFrame, kind: str) -> pl.DataFrame:
-    """All publishers or subscriptions; clients and servers whose calls were seen count as such."""
-    found = [ends.filter(role=kind)]
+    """Make the frame ``publishers`` or ``subscriptions`` (``kind``) of :class:`Objects`.
+
+    Clients and servers whose calls were seen count as both.
+    """
+    parts = [ends.filter(role=kind)]
     internal = pl.col("topic").str.extract("([^/]*)$").is_in(INTERNAL_SERVICES)
     for role, sends, takes in (("client", *_CALL), ("service", *_CALL[::-1])):
-        calls = [events.table(tables, f"rmw_{one}") for one in (f"send_{sends}", f"take_{takes}")]
-        seen = pl.concat(one.select("pid", rmw_handle=f"rmw_{role}_handle") for one in calls)
-        own = ends.filter(~internal, role=role)
-        own = own.join(seen.unique(), on=["pid", "rmw_handle"], how="semi", maintain_order="left")
-        message = f":{sends if kind == 'publisher' else takes}"
-        found.append(own.with_columns(pl.col("topic") + message))
-    return pl.concat(found).drop("role").with_row_index(kind)
+        calls = [
+            events.table(tables, f"rmw_{table}") for table in (f"send_{sends}", f"take_{takes}")
+        ]
+        seen = pl.concat(table.select("pid", rmw_handle=f"rmw_{role}_handle") for table in calls)
+        used = ends.filter(~internal, role=role)
+        used = used.join(seen.unique(), on=["pid", "rmw_handle"], how="semi", maintain_order="left")
+        suffix = f":{sends if kind == 'publisher' else takes}"
+        parts.append(used.with_columns(pl.col("topic") + suffix))
+    return pl.concat(parts).drop("role").with_row_index(kind)
 
 
 def _added(tables: events.EventTables, kind: str, owner: str) -> pl.DataFrame:
-    """Callbacks that were given to objects of a kind: ``pid, handle, valid_from`` and the owner."""
+    """Make a frame of the registrations of callbacks: ``pid, handle, valid_from`` and the owner."""
     added = events.table(tables, f"rclcpp_{kind}_callback_added")
     return added.select("pid", owner, handle="callback", valid_from="time")
 
@@ -167,10 +193,11 @@ def _added(tables: events.EventTables, kind: str, owner: str) -> pl.DataFrame:
 def _subscription_callbacks(
     tables: events.EventTables, subscriptions: pl.DataFrame
 ) -> pl.DataFrame:
-    """Callback ← rclcpp subscription object ← rcl subscription ← node and topic.
+    """Make a frame of subscriptions' callbacks with node and topic.
 
-    The object is matched to the nearest `rclcpp_subscription_init`: for an intra-process twin
-    that event comes just after `callback_added`, for all others just before.
+    Callback ← rclcpp subscription object ← rcl subscription ← node and topic. The object is matched
+    to the nearest `rclcpp_subscription_init`: for an intra-process twin that event comes just after
+    `callback_added`, for all others just before.
     """
     objects = events.table(tables, "rclcpp_subscription_init").select(
         "pid", "subscription", rcl_handle="subscription_handle", created="time"
@@ -189,7 +216,10 @@ def _subscription_callbacks(
 
 
 def _timer_callbacks(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
-    """Callback ← timer (its period before, its node after `rclcpp_timer_callback_added`)."""
+    """Make a frame of timers' callbacks with node and period.
+
+    The event of the period comes before `rclcpp_timer_callback_added`, that of the node after it.
+    """
     timer = ["pid", "timer_handle"]
     created = events.table(tables, "rcl_timer_init")
     created = created.select(*timer, period_ns="period", created="time")
@@ -198,17 +228,21 @@ def _timer_callbacks(tables: events.EventTables, nodes: pl.DataFrame) -> pl.Data
     added = _added(tables, "timer", "timer_handle").with_columns(kind=pl.lit("timer"))
     joined = latest_before(added, created, timer, "valid_from", "created")
     joined = first_after(joined, linked, timer, "valid_from", "linked")
-    # `joined` is sorted by valid_from: a link made after the address was used again is another's.
+    # `joined` is sorted by valid_from: a link made after the address was used again is that of
+    # another timer.
     next_use = pl.col("valid_from").shift(-1).over(timer)
-    own = next_use.is_null() | (pl.col("linked") < next_use)
+    of_this_timer = next_use.is_null() | (pl.col("linked") < next_use)
     at = pl.max_horizontal("linked", "valid_from")
-    joined = _with_node(joined.with_columns(pl.when(own).then("node_handle"), at=at), nodes, "at")
+    joined = _with_node(
+        joined.with_columns(pl.when(of_this_timer).then("node_handle"), at=at), nodes, "at"
+    )
     return joined.select("pid", "handle", "valid_from", "node", "period_ns", "kind")
 
 
 def _service_callbacks(
     tables: events.EventTables, ends: pl.DataFrame, subscriptions: pl.DataFrame
 ) -> pl.DataFrame:
+    """Make a frame of services' callbacks with node and name of the service."""
     added = _added(tables, "service", "service_handle").rename({"service_handle": "end"})
     created = ends.filter(role="service")
     created = created.select("pid", "node", "topic", end="handle", made="valid_from")
@@ -217,10 +251,10 @@ def _service_callbacks(
 
 
 def _listening(ends: pl.DataFrame, subscriptions: pl.DataFrame, to: str) -> pl.DataFrame:
-    """Add the ``subscription`` as which an end of a service is listed, if its calls were seen."""
-    own = subscriptions.filter(pl.col("topic").str.ends_with(to))
-    own = own.select("pid", "subscription", end="handle", created="valid_from")
-    return latest_before(ends, own, ["pid", "end"], "valid_from", "created")
+    """Add the ``subscription`` as which a server or client is listed, if its calls were seen."""
+    entries = subscriptions.filter(pl.col("topic").str.ends_with(to))
+    entries = entries.select("pid", "subscription", end="handle", created="valid_from")
+    return latest_before(ends, entries, ["pid", "end"], "valid_from", "created")
 
 
 def _with_symbols(tables: events.EventTables, registered: pl.DataFrame) -> pl.DataFrame:
@@ -237,7 +271,7 @@ def _with_symbols(tables: events.EventTables, registered: pl.DataFrame) -> pl.Da
 
 
 def _unregistered(tables: events.EventTables, registered: pl.DataFrame) -> pl.DataFrame:
-    """Callbacks that ran before (or without) a registration: tracing started after them."""
+    """Make a frame of callbacks that ran before, or without, an event of their registration."""
     key = ["pid", "handle"]
     known = registered.group_by(key).agg(valid_to=pl.col("valid_from").min())
     started = events.table(tables, "callback_start").lazy().select("pid", "time", handle="callback")
@@ -248,13 +282,13 @@ def _unregistered(tables: events.EventTables, registered: pl.DataFrame) -> pl.Da
     return unknown.filter(early).sort("valid_from", *key)
 
 
-def _told_by_takes(
+def _subscriptions_by_takes(
     tables: events.EventTables, subscriptions: pl.DataFrame, unknown: pl.DataFrame
 ) -> pl.DataFrame:
-    """Those of ``unknown`` callbacks that are subscriptions', as what their threads did right
-    before nearly all of their starts tells: take a message of one subscription, or execute it.
+    """Find those of ``unknown`` callbacks that are a subscription's.
 
-    A callback that was copied, or moved, runs at another address than was registered.
+    A callback that was copied, or moved, runs at another address than the registered one. Right
+    before nearly all of its starts its thread takes a message of one subscription, or executes it.
     """
     thread, key = ["pid", "tid"], ["pid", "handle"]
     columns = ["node", "topic", "subscription"]
@@ -264,13 +298,11 @@ def _told_by_takes(
     starts = started.filter(pl.col("is_intra_process").fill_null(0) == 0)
     starts = starts.select("time", *thread, handle="callback")
     starts = starts.join(unknown, on=key, how="semi", maintain_order="left")
-    before = [
-        latest_before(starts, rows.select(*thread, before="time"), thread, "time", "before",
-                      strictly=name == "callback_start")["before"]
-        for name, rows in (("callback_start", started),
-                           ("callback_end", events.table(tables, "callback_end")))
-    ]  # fmt: skip
-    starts = starts.with_columns(before=pl.max_horizontal(*before))
+    begun = started.select(*thread, begun="time")
+    ended = events.table(tables, "callback_end").select(*thread, ended="time")
+    last_begun = latest_before(starts, begun, thread, "time", "begun", strictly=True)["begun"]
+    last_ended = latest_before(starts, ended, thread, "time", "ended")["ended"]
+    starts = starts.with_columns(before=pl.max_horizontal(last_begun, last_ended))
     votes = []
     for name, handle, owner in (
         ("rmw_take", "rmw_subscription_handle", "rmw_handle"),
@@ -281,36 +313,39 @@ def _told_by_takes(
         rows = rows.filter(pl.col("before").is_null() | (pl.col("did") > pl.col("before")))
         ends = subscriptions.select("pid", *columns, end=owner, created="valid_from")
         votes.append(latest_before(rows, ends, ["pid", "end"], "did", "created"))
-    found = pl.concat(vote.select(*key, "time", *columns) for vote in votes)
-    found = found.drop_nulls("subscription").unique([*key, "time", "subscription"])
-    found = found.group_by(*key, "subscription").agg(pl.len(), *map(pl.first, columns[:2]))
-    found = found.join(starts.group_by(key).agg(starts=pl.len()), on=key)
-    found = found.filter(pl.col("len") >= _NEARLY_ALWAYS * pl.col("starts"))
-    told = found.unique(key, keep="none").select(*key, *columns)
-    return unknown.join(told, on=key, maintain_order="left").with_columns(
+    counted = pl.concat(vote.select(*key, "time", *columns) for vote in votes)
+    counted = counted.drop_nulls("subscription").unique([*key, "time", "subscription"])
+    counted = counted.group_by(*key, "subscription").agg(pl.len(), *map(pl.first, columns[:2]))
+    counted = counted.join(starts.group_by(key).agg(starts=pl.len()), on=key)
+    counted = counted.filter(pl.col("len") >= _NEARLY_ALWAYS * pl.col("starts"))
+    certain = counted.unique(key, keep="none").select(*key, *columns)
+    return unknown.join(certain, on=key, maintain_order="left").with_columns(
         kind=pl.lit("subscription")
     )
 
 
-def _notes_of_told(told: pl.DataFrame) -> tuple[str, ...]:
+def _notes_of_takes(by_takes: pl.DataFrame) -> tuple[str, ...]:
     return tuple(
         f"the callback of {node} for {topic} ran at the address {handle:#x}, which was not"
         " registered: what its thread took right before its starts tells that it is this one."
-        for node, topic, handle in told.select("node", "topic", "handle").iter_rows()
+        for node, topic, handle in by_takes.select("node", "topic", "handle").iter_rows()
     )
 
 
 def _callbackless(
     tables: events.EventTables, subscriptions: pl.DataFrame, registered: pl.DataFrame
 ) -> pl.DataFrame:
-    """What takes messages but has no callback in the trace: rclpy, wait sets, action servers."""
+    """Make a frame of subscriptions and services that have no callback in the trace.
+
+    Such are those of rclpy, wait sets and action servers.
+    """
     bare = subscriptions.join(registered.drop_nulls("subscription"), on="subscription", how="anti")
     takes = events.table(tables, "rmw_take").lazy()
     takes = takes.select("pid", rmw_handle="rmw_subscription_handle").unique()
     takes_messages = bare.join(takes.collect(), on=["pid", "rmw_handle"], how="semi")
     serves = pl.col("topic").str.ends_with(REQUEST)
-    found = pl.concat([takes_messages.filter(~serves), bare.filter(serves)])
-    return found.select(
+    silent = pl.concat([takes_messages.filter(~serves), bare.filter(serves)])
+    return silent.select(
         *("pid", "handle", "valid_from", "node", "subscription"),
         topic=pl.col("topic").str.strip_suffix(REQUEST),
         kind=pl.when(serves).then(pl.lit("service")).otherwise(pl.lit("subscription")),
@@ -319,8 +354,10 @@ def _callbackless(
 
 
 def _timers_of_python(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
-    """Timers that are called, but have no callback in the trace: rclpy. No event says whose they
-    are: it is taken to be the node that their process created last before."""
+    """Make a frame of timers that are called, but have no callback in the trace (rclpy).
+
+    No event says to which node they belong: the last one that their process had created counts.
+    """
     timer = ["pid", "timer_handle"]
     called = events.table(tables, "rcl_timer_call").select(timer).unique()
     created = events.table(tables, "rcl_timer_init").join(called, on=timer, how="semi")
@@ -334,7 +371,7 @@ def _timers_of_python(tables: events.EventTables, nodes: pl.DataFrame) -> pl.Dat
 
 
 def _buffers(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFrame:
-    """Ring buffer → intra-process buffer → subscription object → callback."""
+    """Make the frame ``buffers``: ring buffer → intra-process buffer → subscription → callback."""
     buffers = events.table(tables, "rclcpp_buffer_to_ipb").select(
         "pid", "buffer", "ipb", valid_from="time"
     )
@@ -350,7 +387,7 @@ def _buffers(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFram
 
 
 def _activity(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
-    """Changes between active and not, of lifecycle nodes: in none of their states at first."""
+    """Make the frame ``activity``; a lifecycle node is not active when it is created."""
     machine = ["pid", "state_machine"]
     created = events.table(tables, "rcl_lifecycle_state_machine_init")
     created = _with_node(created.select("time", *machine, "node_handle"), nodes, "time")
@@ -396,14 +433,14 @@ def _notes(tables: events.EventTables, callbacks: pl.DataFrame) -> tuple[str, ..
 
 
 def numbered(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFrame:
-    """Add ``callback_id``: registrations of what is the same callback to a person share one.
+    """Add ``callback_id``: registrations of what a person calls the same callback share one number.
 
     Two registrations are one callback when they belong to the same subscription (intra-process
-    twins), or when node, kind, topic, period and symbol agree and the first was done before the
-    second began: its address was reused, or its last instance started before.
+    twins). Or when node, kind, topic, period and symbol agree and the first had ended before the
+    second began: its address was used again, or its last instance had started.
     """
     missing = pl.format("unknown (process {})", "pid")
-    # An address means nothing without its process; whole traces of threads only have none.
+    # An address means nothing without its process, and some traces have threads only.
     callbacks = (
         callbacks.drop_nulls("pid")
         .sort("valid_from", "handle", maintain_order=True)
@@ -411,7 +448,7 @@ def numbered(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFram
     )
     identity = ["pid", "kind", "node", "topic", "period_ns", "symbol"]
     last_start = _last_starts(tables, callbacks, identity)
-    latest: dict[tuple[object, ...], tuple[int, int]] = {}  # identity → (id, time it was done)
+    latest: dict[tuple[object, ...], tuple[int, int]] = {}  # identity → (id, when it ended)
     of_subscription: dict[int, int] = {}
     ids: list[int] = []
     count = 0
@@ -421,8 +458,8 @@ def numbered(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFram
         *key, subscription, valid_from, valid_to, named = values
         number = of_subscription.get(subscription)
         if number is None and named:
-            previous, done = latest.get(tuple(key), (0, never))
-            number = previous if done <= valid_from else None
+            previous, ended = latest.get(tuple(key), (0, never))
+            number = previous if ended <= valid_from else None
         if number is None:
             number, count = count, count + 1
         ids.append(number)
@@ -436,13 +473,13 @@ def numbered(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFram
 def _last_starts(
     tables: events.EventTables, callbacks: pl.DataFrame, identity: list[str]
 ) -> dict[int, int]:
-    """Row of a registration → time of its last instance, for those that look alike."""
+    """Map rows of registrations that look alike to the start of their last instance (ns)."""
     alike = callbacks.with_row_index("row").filter(pl.len().over(identity) > 1)
     if alike.is_empty():
         return {}
     owner = alike.select("row", "valid_from", "pid", callback="handle")
     starts = events.table(tables, "callback_start").select("time", "pid", "callback")
     starts = starts.join(owner.select("pid", "callback"), on=["pid", "callback"], how="semi")
-    found = latest_before(starts, owner, ["pid", "callback"], "time", "valid_from")
-    last = found.drop_nulls("row").group_by("row").agg(pl.col("time").max())
+    owned = latest_before(starts, owner, ["pid", "callback"], "time", "valid_from")
+    last = owned.drop_nulls("row").group_by("row").agg(pl.col("time").max())
     return dict(last.select("row", "time").iter_rows())

@@ -1,18 +1,17 @@
 """Which outputs of a chain were due while it was recorded, whether they came or not.
 
-An output is due for every traversal, but for
+Every traversal owes an output, except
 
-* one that was under way as the recording, or the plan's time in force, ended: it was to be out
-  later than that;
-* one of a lifecycle node that was not active, or of a message of which a timer or a synchroniser
-  used a newer one (:data:`~.traversals.OWES_NO_OUTPUT`);
-* one that a gate replaced by another of its cycle, or let another go first, as its plan has it
-  (``messages``).
+* a traversal under way when the recording, or the plan's time in force, ended, whose output was due
+  later;
+* one that met a lifecycle node that was not active, or whose message a timer or a synchroniser did
+  not use because it had a newer one (:data:`~.traversals.OWES_NO_OUTPUT`);
+* one whose message a gate replaced by a newer one of its cycle, as its plan has it (``messages``).
 
-With a plan an output of a chain that a timer begins is due in each cycle, also in one in which it
-did not begin: a timer that skipped its expiry, a node that died. How often a chain did not begin
-shows where its beginnings fall behind by whole cycles and stay there. As an application ends, its
-nodes do so one by one: beginnings are not missed in the last tenth of a recording, 3 s at most.
+With a plan, a chain that a timer begins owes an output in each cycle, also if it did not begin: the
+timer skipped an expiry, or the node died. Such cycles show where the chain's beginnings fall behind
+by whole cycles and stay behind. When an application ends, its nodes end one by one: so in the last
+tenth of a recording, 3 s at most, no beginning is missed.
 """
 
 import numpy as np
@@ -24,10 +23,10 @@ from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.traversals import OWES_NO_OUTPUT
 from chainshaper.values.application import Chain
 
-ENDING_NS = 3_000_000_000  # in so long an application ends,
-ENDING_PART = 10  # or in such a part of a short recording
-_CATCHES_UP = 8  # beginnings in which one that was delayed catches up
-_AS_PLANNED = ["replaced", "surplus"]  # "surplus": in recordings of before
+ENDING_NS = 3_000_000_000  # how long an application takes to end,
+ENDING_PART = 10  # but at most this part of a recording (a tenth)
+_CATCHES_UP = 8  # a chain that was delayed catches up within so many beginnings
+_AS_PLANNED = ["replaced", "surplus"]  # "surplus" is in older recordings
 
 
 def with_outputs_due(
@@ -37,10 +36,11 @@ def with_outputs_due(
     limit_ns: int | None,
     until_ns: int | None,
 ) -> pl.DataFrame:
-    """The frame of traversals with the column ``was_due``.
+    """Add the column ``was_due`` to the frame of traversals.
 
-    ``limit_ns`` is how long after its beginning an output is to be out (None: as long as the
-    longest took), ``until_ns`` when the plan was released (None: not before the recording ended).
+    ``limit_ns`` is how long after the chain's beginning an output must be out (None: the longest
+    latency counts). ``until_ns`` is when the plan was released (None: not before the recording
+    ended).
     """
     ended = int(flow.instances["start"].max() or 0) if until_ns is None else until_ns  # type: ignore[arg-type]
     longest = frame["latency_ns"].max() or 0
@@ -55,7 +55,7 @@ def with_outputs_due(
 
 
 def _running_until(flow: DataFlow, until_ns: int | None) -> int:
-    """Until when every node of an application ran, as far as none ended by itself."""
+    """The instant until which every node ran, unless it ended by itself (ns)."""
     if until_ns is not None:
         return until_ns
     times = flow.instances["start"]
@@ -69,27 +69,27 @@ def not_begun(
     due: Due,
     between: tuple[int, int | None] | None,
 ) -> int:
-    """In how many cycles of a plan a chain that a timer begins did not begin, after it first had.
+    """Count the cycles of a plan, after the first, in which a chain did not begin.
 
-    Cycles in which its first callback ran and published nothing are not among them. Where a message
-    begins the chain nothing was due without one.
+    Cycles in which its first callback ran and published nothing do not count. A chain that a
+    message begins owes nothing without one: the number is 0.
     """
     if timer_period(flow, chain) is None:
         return 0
-    own = flow.instances.filter(pl.col("callback_id") == chain.callbacks[0])["start"].sort()
+    starts = flow.instances.filter(pl.col("callback_id") == chain.callbacks[0])["start"].sort()
     since_ns, until_ns = between or (0, None)
-    own = own.filter(own >= since_ns)
-    own = own if until_ns is None else own.filter(own < until_ns)
-    if not len(own):
+    starts = starts.filter(starts >= since_ns)
+    starts = starts if until_ns is None else starts.filter(starts < until_ns)
+    if not len(starts):
         return 0
-    behind = own.to_numpy() - np.arange(len(own)) * due.cycle_ns
+    behind = starts.to_numpy() - np.arange(len(starts)) * due.cycle_ns
     skipped = int(_stays_behind(behind, due.cycle_ns).sum())
-    quiet = _running_until(flow, until_ns) - int(own[-1]) - due.cycles * due.cycle_ns
+    quiet = _running_until(flow, until_ns) - int(starts[-1]) - due.cycles * due.cycle_ns
     return skipped + max(0, round(quiet / due.cycle_ns - 1))
 
 
 def _stays_behind(behind: npt.NDArray[np.int64], cycle_ns: int) -> npt.NDArray[np.int64]:
-    """By how many whole cycles each beginning, and those after it, are behind the one before."""
+    """By how many whole cycles each beginning, and the next ones, fall behind the one before."""
     ahead = np.append(behind[1:], np.full(_CATCHES_UP, behind[-1]))
     least = np.lib.stride_tricks.sliding_window_view(ahead, _CATCHES_UP)[: len(behind) - 1]
     rise = least.min(axis=1) - behind[:-1]

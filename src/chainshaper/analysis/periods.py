@@ -1,10 +1,11 @@
-"""Periods of timers as their callbacks' starts show them, where they are not those declared.
+"""Periods of timers that their callbacks' starts show, where these differ from the declared ones.
 
-A timer says its period once, when it is created. It can be changed at run time, of which no event
-tells, or a library traces it in another unit. rclcpp keeps to the grid of the period however late
-single starts are, so that their number in a time tells. Starts may be rarer for other reasons: the
-executor is busy when the timer is due, it is cancelled, or reset. Those are no other period: it
-takes regular starts for which the thread waited although the declared period was over.
+The event of a timer's creation has its period. A program can change it at run time, which no event
+shows, and some libraries trace it in another unit. rclcpp keeps to the grid of the period however
+late single starts are, so the number of starts in a span shows the period. Starts may be rarer for
+other reasons: the executor is busy when the timer is due, or the timer is cancelled or reset. These
+do not count as another period. That needs regular starts before which the thread waited although
+the declared period was over.
 """
 
 from collections.abc import Iterator
@@ -15,34 +16,34 @@ import numpy.typing as npt
 import polars as pl
 
 FEWEST = 8
-"""So many distances of starts it takes to say something."""
-_SAME = 0.02  # by this share a period may be off
-_REGULAR = 0.1  # by this share of the usual one, distances of starts are off at most
-_MOSTLY = 0.8  # so many of them
-_IDLE = 0.1  # for this share of its period a thread waits in vain
-_CLOCKS = 1e-4  # so far may the clock of timers and that of events run apart
+"""How many distances between starts are needed for a verdict."""
+_SAME = 0.02  # share of a period by which another one may differ and still be the same
+_REGULAR = 0.1  # share of the usual distance of starts by which regular ones may differ from it
+_MOSTLY = 0.8  # the share of starts that must be regular, or come after waiting
+_IDLE = 0.1  # share of the period for which a thread that waited had nothing to do
+_CLOCKS = 1e-4  # how far the clock of timers and that of events may run apart
 
 
 @dataclass(frozen=True)
-class OtherPeriod:
-    """A timer's callback whose starts contradict the declared period.
-
-    ``period_ns`` is what they show; None: they come more often than declared, but not regularly.
-    """
+class ShownPeriod:
+    """The period that a timer's starts show, where it differs from the declared one."""
 
     callback_id: int
     node: str
     declared_ns: int
-    usual_ns: int
-    period_ns: int | None
-    starts: int
-    first_ns: int
+    usual_ns: int  # median distance of its starts
+    period_ns: int | None  # None: starts come more often than declared, but not regularly
+    starts: int  # their number
+    first_ns: int  # instant of the first
 
 
-def other_periods(
+def shown_periods(
     callbacks: pl.DataFrame, instances: pl.DataFrame, taken: pl.DataFrame
-) -> Iterator[OtherPeriod]:
-    """The timers whose starts contradict their period; nodes that follow `/clock` have its pace."""
+) -> Iterator[ShownPeriod]:
+    """Find the timers whose starts contradict their declared period.
+
+    Timers of nodes that take `/clock` are left out: they have the pace of the simulation.
+    """
     timers = callbacks.filter(pl.col("kind") == "timer", pl.col("period_ns") > 0)
     simulated = taken.filter(topic="/clock")["node"].unique().cast(pl.String)
     timers = timers.filter(~pl.col("node").is_in(simulated.implode()))
@@ -59,13 +60,21 @@ def other_periods(
         ):
             continue
         period = _period(apart, usual) if regular else None
-        yield OtherPeriod(number, node, declared, round(usual), period, len(starts), int(starts[0]))
+        yield ShownPeriod(
+            callback_id=number,
+            node=node,
+            declared_ns=declared,
+            usual_ns=round(usual),
+            period_ns=period,
+            starts=len(starts),
+            first_ns=int(starts[0]),
+        )
 
 
 def _off_their_grid(
     timers: pl.DataFrame, instances: pl.DataFrame
 ) -> Iterator[tuple[int, str, int]]:
-    """``callback_id, node, period_ns`` of timers whose number of starts does not fit the period."""
+    """Find timers whose number of starts does not fit their period: id, node and period (ns)."""
     start = pl.col("start")
     started = instances.lazy().select("callback_id", "start")
     started = started.join(timers.lazy().select("callback_id"), on="callback_id", how="semi")
@@ -76,13 +85,13 @@ def _off_their_grid(
     off = (pl.col("span") < expected * (1 - _SAME) - declared) | (
         pl.col("span") > expected * (1 + _SAME) + declared
     )
-    found = counted.join(timers.lazy(), on="callback_id").filter(off, pl.col("count") >= FEWEST)
+    off_grid = counted.join(timers.lazy(), on="callback_id").filter(off, pl.col("count") >= FEWEST)
     columns = ("callback_id", "node", "period_ns")
-    return found.sort("callback_id").select(columns).collect().iter_rows()
+    return off_grid.sort("callback_id").select(columns).collect().iter_rows()
 
 
 def _too_often(starts: npt.NDArray[np.int64], declared: int) -> bool:
-    """Whether there are more starts than a timer of this period has in the time."""
+    """Whether there are more starts than a timer of this period has in their span."""
     span, count = float(starts[-1] - starts[0]), len(starts) - 1
     return span < count * declared * (1 - _SAME) - declared
 
@@ -90,23 +99,25 @@ def _too_often(starts: npt.NDArray[np.int64], declared: int) -> bool:
 def _waited_in_vain(
     callbacks: pl.DataFrame, instances: pl.DataFrame, timer: int, declared: int, usual: float
 ) -> bool:
-    """Whether before a start, as a rule, neither its thread nor its node had anything to do, though
-    the declared period was over."""
+    """Whether most starts came late although their thread and their node had nothing to do.
+
+    Late means: the declared period was over since the start before.
+    """
     nodes = callbacks.unique("callback_id").select("callback_id", "node")
     rows = instances.join(nodes, on="callback_id", how="left", maintain_order="left")
     rows = rows.with_columns(over=pl.coalesce("end", "start"))
     rows = rows.with_columns(
         pl.col("over").shift(1).over("pid", key).alias(f"over_{key}") for key in ("tid", "node")
     )
-    own = rows.filter(pl.col("callback_id") == timer)
+    of_timer = rows.filter(pl.col("callback_id") == timer)
     due = pl.col("start").shift(1) + declared
     free = pl.max_horizontal(due, "over_tid", "over_node")
     waited = (pl.col("start") - free > _IDLE * usual).filter(due.is_not_null())
-    return float(own.select(waited.mean()).item() or 0.0) >= _MOSTLY
+    return float(of_timer.select(waited.mean()).item() or 0.0) >= _MOSTLY
 
 
 def _period(apart: npt.NDArray[np.int64], usual: float) -> int:
-    """The roundest period that the distances of regular starts agree with (ns)."""
+    """The period with the fewest digits that the distances of regular starts agree with (ns)."""
     cycles = int(np.maximum(1, np.round(apart / usual)).sum())
     mean = float(apart.sum() / cycles)
     low, high = np.percentile(apart, (10, 90))

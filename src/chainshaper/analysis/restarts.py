@@ -1,9 +1,9 @@
 """Nodes that were started again: which processes of one node's name followed each other.
 
-A node that dies and is started again is another process, with other callbacks, and still one node:
-its callbacks go on where they ended. Two processes that run a node of one name at the same time are
-two nodes. What tells the two cases apart is when each process was seen: one that had its last event
-before another one's first was followed by it.
+A node that dies and is started again is another process with other handles, and still one node: its
+callbacks continue in the new process. Two processes that run nodes of one name at the same time are
+two nodes. The times of events distinguish the two cases: if the last event of a process lies before
+the first one of another, the second process followed the first.
 """
 
 from collections import defaultdict
@@ -20,11 +20,12 @@ FOLLOWED = pl.Schema({"node": pl.String, "pid": pl.Int32, "last_pid": pl.Int32})
 def followed_processes(
     tables: events.EventTables, objects: Objects, ended: Collection[int] | None = None
 ) -> pl.DataFrame:
-    """``node, pid, last_pid``: for each process of a node that was started again, its last one.
+    """Make a frame that gives each process of a node that was started again the node's last one.
 
-    Nodes that were not started again have no row. ``ended`` are the processes that are known to
-    have ended; without them, a process had ended where a later one of its node's name had its
-    first event behind its own last event. Where several had, the one that ended last is followed.
+    Columns: ``node, pid, last_pid``. Nodes that were not started again have no row. ``ended`` are
+    the processes that are known to have ended. Without that, a process has ended if a process with
+    its node's name has its first event after this one's last. If several have ended, the new
+    process follows the one that ended last.
     """
     processes = defaultdict[str, set[int]](set)
     for name in ("nodes", "callbacks"):
@@ -46,34 +47,39 @@ def followed_processes(
 def _successions(
     pids: Sequence[int], spans: dict[int, tuple[int, int]], ended: Collection[int] | None
 ) -> list[list[int]]:
-    """Processes of one node's name, in order of their first event, put behind each other."""
-    found: list[list[int]] = []
+    """Put processes of one node's name into rows in which each follows the one before.
+
+    ``pids`` are in order of their first event.
+    """
+    successions: list[list[int]] = []
     if ended is not None:  # what runs follows what has ended, whenever it began
         pids = sorted(pids, key=lambda pid: (pid not in ended, spans[pid]))
     for pid in pids:
         began = spans[pid][0]
         over = [
-            one
-            for one in found
-            if (spans[one[-1]][1] < began if ended is None else one[-1] in ended)
+            succession
+            for succession in successions
+            if (spans[succession[-1]][1] < began if ended is None else succession[-1] in ended)
         ]
         if over:
-            max(over, key=lambda one: spans[one[-1]][1]).append(pid)
+            max(over, key=lambda succession: spans[succession[-1]][1]).append(pid)
         else:
-            found.append([pid])
-    return found
+            successions.append([pid])
+    return successions
 
 
 def _spans(tables: events.EventTables, pids: Collection[int]) -> dict[int, tuple[int, int]]:
-    """Each process's first and last event (ns)."""
+    """Map each process to the instants of its first and last event (ns)."""
     spans: dict[int, tuple[int, int]] = {}
     for name in tables:
         table = tables[name]
         if not {"pid", "time"} <= {*table.columns}:
             continue
-        own = table.lazy().filter(pl.col("pid").is_in(list(pids))).group_by("pid")
+        events_of_pids = table.lazy().filter(pl.col("pid").is_in(list(pids))).group_by("pid")
         for pid, first, last in (
-            own.agg(first=pl.col("time").min(), last=pl.col("time").max()).collect().iter_rows()
+            events_of_pids.agg(first=pl.col("time").min(), last=pl.col("time").max())
+            .collect()
+            .iter_rows()
         ):
             before = spans.get(pid, (first, last))
             spans[pid] = min(first, before[0]), max(last, before[1])

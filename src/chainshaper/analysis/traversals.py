@@ -1,29 +1,30 @@
-"""Traversals of a chain: following every message from the first callback to the last topic.
+"""Traversals of a chain: each message is followed from the first callback to the last topic.
 
 A traversal (paper, section 2.4, figure 2) begins with the `callback_start` of an instance of the
 chain's first callback, goes on from a publication to the instance whose take has the same topic and
 source timestamp, and ends with the publication of the chain's last topic: the latency L.
 
-**Which publication a message goes into.** Those made on the hop's topic inside the instance that
-read it. If there is none, and other callbacks of the node publish this topic too (synchronising
-callbacks, stored messages: :mod:`~chainshaper.analysis.graph`), that of the node's first instance
-which starts after it and publishes the topic; what several threads publish in instances that run
-already has got its inputs before, but for a set's inputs that start at once, of which any may
-complete it. For message_filters that is the soonest set that the message can be in. An
-approximate-time synchroniser may hold messages back; outputs into which no new input went give that
-away, and ``notes`` says that L is a lower bound.
+**Which publication a message goes into.** All that the instance which read it publishes on the
+hop's topic. If there are none, and other callbacks of the node publish this topic too
+(synchronising callbacks, stored messages: :mod:`~chainshaper.analysis.graph`), the message goes
+into the publication of the node's first instance that starts afterwards and publishes the topic.
+An instance that runs already, on another thread, has got its inputs before. The exception is a set
+whose inputs start at the same time: any of them may complete it. For message_filters this is the
+soonest set that the message can be in. An approximate-time synchroniser may hold messages back;
+then there are outputs into which no new input went, and ``notes`` says that L is a lower bound.
 
-**The newest message counts.** Of several messages that a node stored for one publication, of a
-timer or of a synchroniser of its own, the newest is taken to be in it, as in a variable that is
-overwritten: L is the age of what was published. The others are incomplete, "not used"; no output is
-missing for them. message_filters has queues instead: there each message counts, also where several
-came before one publication, of which only one can have been in it; ``notes`` says so.
+**The newest message counts.** A node stores messages in a variable, and a timer, or a synchroniser
+written by hand, publishes from it. Of several messages stored before one publication the newest
+counts as the one in it: L is the age of what was published. The others are incomplete, with the
+reason "not used"; no output is missing for them. message_filters has queues instead: there each
+message counts, also where several came before one publication although only one can have been in
+it; ``notes`` says so.
 
 **One row per data flow.** An instance that publishes a topic twice makes two traversals, with
 the same start.
 
-**A standby.** What a shaping node's standby published for it, while it was not there, is the
-chain's output: the traversal goes on with the standby's instance.
+**A standby.** While a shaping node is not there, its standby publishes the chain's output: the
+traversal goes on with the standby's instance.
 
 **Silent instances.** An instance of the first callback that ended and published nothing on the
 chain's first topic begins no traversal: callbacks may publish on a condition. Further down, where
@@ -70,7 +71,7 @@ REASONS: dict[str, str] = {
 OWES_NO_OUTPUT = ("not used", "inactive")
 """Reasons for which no output is missing."""
 
-_SILENT = ["not published", "inactive"]
+_SILENT = ["not published", "inactive"]  # of an instance of the first callback: no traversal
 _IN_NODE = [*_SILENT, "not used", "discarded", "not sent", "still running"]
 _WITHOUT_EFFECT = ["not published", "lost", "not taken", "take not recorded", "not executed"]
 _REASON = pl.Enum(list(REASONS))
@@ -79,25 +80,36 @@ _VIA = pl.Enum(["instance", "sibling"])
 
 @dataclass(frozen=True)
 class Traversals:
-    """All traversals of one chain.
+    """All traversals of one chain. Times are in ns of the event clock.
 
-    ``frame`` has one row per traversal, sorted by start: ``traversal`` (numbered from 0),
-    ``start``, ``end``, ``latency_ns`` (null when incomplete), ``complete``, ``publication`` (the
-    output's number in the data flow), ``broken_hop`` and ``broken_at`` (place in the chain and
-    topic where an incomplete one stopped) and ``reason`` (a key of :data:`REASONS`).
+    ``frame`` has one row per traversal, sorted by start:
 
-    ``hops`` has one row per traversal and callback reached, sorted by hop: ``traversal``,
-    ``hop`` (from 0), ``callback_id`` (of a standby where that published for its shaping node),
-    ``topic`` (that it publishes), ``instance``, the times
-    ``take``, ``start``, ``publish`` and ``end`` (of the instance), ``source_timestamp`` (of the
-    message it took), ``communication_ns`` (previous publication to start: transport and waiting),
-    ``computation_ns`` (start to publication, without the next), ``waiting_ns`` (in the node: from
-    the end of the instance until another callback of the node began, which published for it; in a
-    gate, from the arrival until it let go; for a publisher's thread, until that sent it), and
-    ``via``: ``instance`` when the instance itself published, ``sibling`` when another callback of
-    its node did. Over a complete traversal the three parts add up to the latency.
+    * ``traversal``: numbered from 0.
+    * ``start``, ``end``, ``latency_ns``: ``end`` and the latency are null when it is incomplete.
+    * ``complete``.
+    * ``publication``: number of the output in the data flow.
+    * ``broken_hop``, ``broken_at``: place in the chain, and topic, where an incomplete one stopped.
+    * ``reason``: why it is incomplete, a key of :data:`REASONS`.
 
-    ``silent`` counts instances of the first callback that published nothing.
+    ``hops`` has one row per traversal and callback that it reached, sorted by hop:
+
+    * ``traversal``, ``hop`` (from 0).
+    * ``callback_id``: the standby's, where a standby published for its shaping node.
+    * ``topic``: that the callback publishes.
+    * ``instance``: its number in the data flow.
+    * ``take``, ``start``, ``publish``, ``end``: instants of the instance.
+    * ``source_timestamp``: of the message that it took.
+    * ``communication_ns``: from the previous publication to the start.
+    * ``computation_ns``: from the start to the publication, without the waiting.
+    * ``waiting_ns``: within the node, of three kinds. From the end of the instance until another
+      callback of the node began which published for it; in a gate, from the arrival until the
+      release; for a publisher's thread, until it sent the message.
+    * ``via``: ``instance`` when the instance itself published, ``sibling`` when another callback
+      of its node did.
+
+    Over a complete traversal communication, computation and waiting add up to the latency.
+
+    ``silent`` counts the instances of the first callback that published nothing.
     """
 
     chain: Chain
@@ -112,8 +124,9 @@ def traverse(flow: DataFlow, chain: Chain, graph: ApplicationGraph | None = None
 
     Cost is a few joins per hop, linear in the messages of the chain.
     """
-    # While it is followed, a traversal is a row of numbers: for every hop h the `instance_h`, the
-    # `take_h` it read, the `publication_h` it went into and whether that was a `sibling_h`'s.
+    # While traversals are followed, the `state` has a row of numbers for each. Columns per hop h:
+    # `instance_h`, the `take_h` that it read, the `publication_h` that the message went into, and
+    # whether a sibling published that (`sibling_h`). Columns of the whole: `broken_hop`, `reason`.
     # Numbers are rows of the data flow's frames, so times are looked up when they are needed.
     graph = graph or graph_of(flow)
     path = graph.path(chain)
@@ -132,7 +145,7 @@ def traverse(flow: DataFlow, chain: Chain, graph: ApplicationGraph | None = None
         state = _unless_published(flow, state, hop)
         state = _unless_active(flow, state, hop, callback)
         if hop == 0:
-            # One whose process died as it ran is no silent one: it might have published.
+            # An instance whose process died while it ran is not silent: it might have published.
             ended = _looked_up(flow.instances, "end", "instance_0").is_not_null()
             begun = state.filter(~(ended & pl.col("reason").is_in(_SILENT).fill_null(False)))
             silent, state = state.height - begun.height, begun
@@ -143,11 +156,11 @@ def traverse(flow: DataFlow, chain: Chain, graph: ApplicationGraph | None = None
 
 
 def _begun(flow: DataFlow, first: Callback) -> pl.DataFrame:
-    """One row per instance of the first callback, with what it took if it is a subscription."""
-    own = pl.col("callback_id") == first.id
-    taken = flow.takes.filter(own & pl.col("instance").is_not_null())
+    """Begin the state: a row per instance of the first callback, with its take if it has one."""
+    of_callback = pl.col("callback_id") == first.id
+    taken = flow.takes.filter(of_callback & pl.col("instance").is_not_null())
     take = by_number(taken, "instance", "take", flow.instances.height)
-    return flow.instances.filter(own).select(
+    return flow.instances.filter(of_callback).select(
         instance_0="instance",
         take_0=pl.lit(take).gather("instance"),
         broken_hop=pl.lit(None, dtype=pl.UInt8),
@@ -156,13 +169,13 @@ def _begun(flow: DataFlow, first: Callback) -> pl.DataFrame:
 
 
 def _standby(graph: ApplicationGraph, callback: Callback, topic: str) -> list[int]:
-    """The callback that publishes the topic while this one, a shaping node's, is not there."""
+    """Ids of the standby's callback, which publishes while this shaping node is not there."""
     return [
-        one.id
-        for one in graph.callbacks
-        if one.node == callback.node + STANDBY
-        and one.trigger == callback.trigger
-        and topic in one.publishes
+        other_callback.id
+        for other_callback in graph.callbacks
+        if other_callback.node == callback.node + STANDBY
+        and other_callback.trigger == callback.trigger
+        and topic in other_callback.publishes
     ]
 
 
@@ -170,48 +183,53 @@ def _publish(
     flow: DataFlow, state: pl.DataFrame, hop: int, callbacks: Sequence[int], topic: str
 ) -> pl.DataFrame:
     """Add the publications of the hop's topic inside each traversal's instance."""
-    own = pl.col("callback_id").is_in(callbacks) & (pl.col("topic") == topic)
-    inside = flow.publications.filter(own & pl.col("instance").is_not_null())
+    for_hop = pl.col("callback_id").is_in(callbacks) & (pl.col("topic") == topic)
+    inside = flow.publications.filter(for_hop & pl.col("instance").is_not_null())
     instance, publication = f"instance_{hop}", f"publication_{hop}"
     first = by_number(inside, "instance", "publication", flow.instances.height)
     if first.count() == inside.height:
         state = state.with_columns(first.gather(state[instance]).alias(publication))
     else:  # an instance that publishes several times begins as many traversals
-        named = inside.select(**{instance: "instance", publication: "publication"})
-        state = state.join(named, on=instance, how="left", maintain_order="left")
+        numbers = inside.select(**{instance: "instance", publication: "publication"})
+        state = state.join(numbers, on=instance, how="left", maintain_order="left")
     return state.with_columns(pl.lit(False).alias(f"sibling_{hop}"))
 
 
 def _publish_by_sibling(
     flow: DataFlow, state: pl.DataFrame, hop: int, callback: Callback, topic: str
 ) -> tuple[pl.DataFrame, list[str]]:
-    """Fill in what the node's first instance after this one's start publishes.
+    """Fill in what another callback of the node published for the message.
 
-    A node that was created anew in between knows nothing of the messages of the one before it.
-    Also returns notes where it is not clear which input an output of message_filters got.
+    It is the publication of the node's first instance that starts after the message's own. Messages
+    from before the node was started again have none: the new process never got them. The notes say
+    where it is not clear which input an output of message_filters got.
     """
     publication, sibling = f"publication_{hop}", f"sibling_{hop}"
     publishers = flow.objects.publishers.select("publisher", created="valid_from")
     of_node = pl.col("pid").is_in(callback.processes) & (pl.col("node") == callback.node)
-    here = flow.publications.filter((pl.col("topic") == topic) & of_node)
+    candidates = flow.publications.filter((pl.col("topic") == topic) & of_node)
     began = pl.coalesce(_looked_up(flow.instances, "start", "instance"), "time")
-    here = here.select("publisher", "callback_id", "time", later="publication", began=began)
-    here = here.join(publishers, on="publisher", how="left", maintain_order="left")
+    candidates = candidates.select(
+        "publisher", "callback_id", "time", later="publication", began=began
+    )
+    candidates = candidates.join(publishers, on="publisher", how="left", maintain_order="left")
     waiting = pl.col(publication).is_null() & pl.col(f"instance_{hop}").is_not_null()
     start = _looked_up(flow.instances, "start", f"instance_{hop}")
     rows = state.with_row_index("row").filter(waiting).select("row", start=start)
     if topic in callback.in_turns:
-        here = _begun_with_last_input(here.sort("began"), rows["start"].sort(), callback.id)
-    found = first_after(rows, here, [], "start", "began", strictly=True)
-    found = found.filter(pl.col("created") <= pl.col("start"))
-    later = by_number(found, "row", "later", state.height)
+        candidates = _begun_with_last_input(
+            candidates.sort("began"), rows["start"].sort(), callback.id
+        )
+    matches = first_after(rows, candidates, [], "start", "began", strictly=True)
+    matches = matches.filter(pl.col("created") <= pl.col("start"))
+    later = by_number(matches, "row", "later", state.height)
     state = state.with_columns(
         pl.coalesce(publication, later), (pl.col(sibling) | later.is_not_null()).alias(sibling)
     )
     if callback.kind == "service" or MESSAGE_FILTER not in (callback.symbol or MESSAGE_FILTER):
         return state, []  # a callback that stores its latest message: old values are its purpose
     reached = state[publication].drop_nulls()
-    between = here.filter(pl.col("later").is_between(reached.min(), reached.max())).height
+    between = candidates.filter(pl.col("later").is_between(reached.min(), reached.max())).height
     missed = between - reached.n_unique()
     note = (
         f"{missed} of {between} publications on {topic} came without a new message on "
@@ -229,21 +247,21 @@ def _publish_by_sibling(
 
 
 def _keeps_newest(graph: ApplicationGraph, callback: Callback, topic: str) -> bool:
-    """Whether a node that stores what the callback reads has the newest message only."""
+    """Whether the node stores only the newest of the messages that the callback reads."""
     if callback.kind == "service":
         return False  # each goal of an action has feedback of its own
     by_timer = any(
-        one.kind == "timer" and topic in one.publishes
-        for one in graph.callbacks
-        if (one.node, one.pid) == (callback.node, callback.pid)
+        sibling.kind == "timer" and topic in sibling.publishes
+        for sibling in graph.callbacks
+        if (sibling.node, sibling.pid) == (callback.node, callback.pid)
     )
     return by_timer or MESSAGE_FILTER not in (callback.symbol or MESSAGE_FILTER)
 
 
 def _newest_alone(state: pl.DataFrame, hop: int) -> pl.DataFrame:
-    """The state in which of several messages that went into one publication the newest did alone.
+    """Of several messages that went into one publication, let only the newest do so.
 
-    A node that stores messages has the newest when it publishes: those before it are not used.
+    The others are marked "not used".
     """
     instance, publication = f"instance_{hop}", f"publication_{hop}"
     newest = pl.col(instance).max().over(publication)
@@ -252,46 +270,54 @@ def _newest_alone(state: pl.DataFrame, hop: int) -> pl.DataFrame:
     return state.with_columns(pl.when(~older).then(publication).alias(publication))
 
 
-def _begun_with_last_input(here: pl.DataFrame, stored: pl.Series, callback: int) -> pl.DataFrame:
-    """Outputs whose ``began`` lies behind each input that ``callback`` stored for them.
+def _begun_with_last_input(outputs: pl.DataFrame, stored: pl.Series, callback: int) -> pl.DataFrame:
+    """Move ``began`` of outputs behind the start of the input that ``callback`` gave them.
 
-    Of inputs that start at once on several threads the lock of the set makes one the last: where
-    none was ``stored`` since the output before, the first that started while this one ran was.
+    ``stored`` has the starts of the callback's instances that did not publish themselves. When the
+    inputs of a set start at the same time on several threads, a lock decides which comes last. So
+    where no input was stored since the output before, the output got the first one that was stored
+    while its own instance ran.
     """
-    before = stored.search_sorted(here["began"]).to_numpy()
-    following = pl.Series(np.append(stored.to_numpy(), np.iinfo(np.int64).max)[before])
-    none = pl.Series(np.diff(before, prepend=0) == 0) & (here["callback_id"] != callback)
-    late = none & (following < here["time"])
-    return here.with_columns(began=pl.when(late).then(following + 1).otherwise("began"))
+    stored_before = stored.search_sorted(outputs["began"]).to_numpy()
+    following = pl.Series(np.append(stored.to_numpy(), np.iinfo(np.int64).max)[stored_before])
+    nothing_stored = pl.Series(np.diff(stored_before, prepend=0) == 0) & (
+        outputs["callback_id"] != callback
+    )
+    late = nothing_stored & (following < outputs["time"])
+    return outputs.with_columns(began=pl.when(late).then(following + 1).otherwise("began"))
 
 
 def _unless_published(flow: DataFlow, state: pl.DataFrame, hop: int) -> pl.DataFrame:
-    """Mark the traversals whose message no publication of the hop carried on, or did not leave."""
+    """Mark the traversals whose message was not published at the hop, or was never sent."""
     instance, publication = pl.col(f"instance_{hop}"), pl.col(f"publication_{hop}")
     stuck = instance.is_not_null() & publication.is_null()
     ended = _looked_up(flow.instances, "end", f"instance_{hop}").is_not_null()
-    if flow.followed.height:  # processes that were started again, as which nothing runs any more
+    if flow.followed.height:  # of a process that was started again no instance runs any more
         followed = flow.followed.filter(pl.col("pid") != pl.col("last_pid"))["pid"].unique()
         ended |= _looked_up(flow.instances, "pid", f"instance_{hop}").is_in(followed.implode())
-    why = pl.when(ended).then(pl.lit("not published")).otherwise(pl.lit("still running"))
+    reason = pl.when(ended).then(pl.lit("not published")).otherwise(pl.lit("still running"))
     if "gate_release" in flow.events:
         withheld = discarded_instances(flow.takes, flow.events, flow.objects, flow.instances)
-        gone = pl.lit(withheld).gather(instance)
-        why = pl.when(ended & gone.is_not_null()).then(pl.lit("discarded")).otherwise(why)
-    state = _broken(state, stuck, hop, why)
+        withheld_here = pl.lit(withheld).gather(instance)
+        reason = (
+            pl.when(ended & withheld_here.is_not_null()).then(pl.lit("discarded")).otherwise(reason)
+        )
+    state = _broken(state, stuck, hop, reason)
     unsent = flow.publications["sent"].is_null()
     if not unsent.any():
         return state
-    waits = pl.lit(unsent).gather(publication).fill_null(False)
+    never_left = pl.lit(unsent).gather(publication).fill_null(False)
     reasons = pl.lit(why_not_sent(flow.publications, flow.events, flow.objects))
-    return _broken(state, waits, hop, reasons.gather(publication))
+    return _broken(state, never_left, hop, reasons.gather(publication))
 
 
 def _unless_active(
     flow: DataFlow, state: pl.DataFrame, hop: int, callback: Callback
 ) -> pl.DataFrame:
-    """Say so of traversals that stopped at this hop because its lifecycle node was not active: in
-    the node, also where its subscription did not even exist."""
+    """Mark traversals that stopped at this hop because its lifecycle node was not active.
+
+    Also those whose message was not taken: an inactive node may not even have a subscription.
+    """
     changes = flow.objects.activity.filter(
         pl.col("pid").is_in(callback.processes), node=callback.node
     )
@@ -303,8 +329,8 @@ def _unless_active(
     if hop:
         came = pl.coalesce(came, _looked_up(flow.publications, "time", f"publication_{hop - 1}"))
     rows = state.with_row_index("row").select("row", came=came)
-    found = latest_before(rows, changes.select("time", "active"), [], "came", "time")
-    active = by_number(found, "row", "active", state.height).fill_null(False)
+    states = latest_before(rows, changes.select("time", "active"), [], "came", "time")
+    active = by_number(states, "row", "active", state.height).fill_null(False)
     idle = pl.lit("inactive", dtype=_REASON)
     return state.with_columns(reason=pl.when(stopped & ~active).then(idle).otherwise("reason"))
 
@@ -318,37 +344,39 @@ def _take(
     standby: Sequence[int],
     topic: str,
 ) -> pl.DataFrame:
-    """Add the instance of ``callback`` that took each traversal's latest publication, or that of
-    its ``standby`` which published for it."""
+    """Add the instance that took each traversal's latest publication.
+
+    It is an instance of ``callback``, or of the ``standby`` that published for it.
+    """
     taken = flow.takes.filter(pl.col("publication").is_not_null())
-    own = taken.filter(pl.col("callback_id") == callback.id)
-    own = own.select("publication", "take", "instance")
-    # Should a message have been taken twice, the take that led to an execution is followed, of
-    # several the first: what is laid out last stays.
+    by_callback = taken.filter(pl.col("callback_id") == callback.id)
+    by_callback = by_callback.select("publication", "take", "instance")
+    # If a message was taken twice, the first take that led to an execution is followed. Of several
+    # rows with one number `by_number` takes the last, so the best ones come last.
     executed = pl.col("instance").is_not_null()
-    layers = [own.filter(~executed).reverse(), own.filter(executed).reverse()]
+    layers = [by_callback.filter(~executed).reverse(), by_callback.filter(executed).reverse()]
     if standby:
         published = flow.publications.filter(pl.col("topic") == topic)["instance"].drop_nulls()
         passed_on = pl.col("instance").is_in(published.implode())
-        for_it = taken.filter(pl.col("callback_id").is_in(standby)).select(own.columns)
-        layers += [for_it.filter(passed_on).reverse(), own.filter(passed_on).reverse()]
+        by_standby = taken.filter(pl.col("callback_id").is_in(standby)).select(by_callback.columns)
+        layers += [by_standby.filter(passed_on).reverse(), by_callback.filter(passed_on).reverse()]
     taken = pl.concat(layers)
     before, height = pl.col(f"publication_{hop - 1}"), flow.publications.height
     laid_out = {name: by_number(taken, "publication", name, height) for name in taken.columns[1:]}
     state = state.with_columns(
         pl.lit(numbers).gather(before).alias(f"{name}_{hop}") for name, numbers in laid_out.items()
     )
-    latest = pl.lit(taken["publication"].max(), dtype=pl.UInt32)
-    later = (before < latest).fill_null(False)  # they are numbered in order of time
-    why = pl.when(later).then(pl.lit("lost")).otherwise(pl.lit("not taken"))
-    if callback.id in flow.untold:
-        why = pl.lit("take not recorded")
+    last_taken = pl.lit(taken["publication"].max(), dtype=pl.UInt32)
+    later = (before < last_taken).fill_null(False)  # they are numbered in order of time
+    reason = pl.when(later).then(pl.lit("lost")).otherwise(pl.lit("not taken"))
+    if callback.id in flow.without_takes:
+        reason = pl.lit("take not recorded")
     if flow.publications["intra_time"].count():
         buffers = flow.objects.buffers
         overwritten = overwritten_in(flow.events, flow.publications, buffers, callback.id)
-        gone = pl.lit(overwritten.implode())
-        why = pl.when(before.is_in(gone)).then(pl.lit("overwritten")).otherwise(why)
-    state = _broken(state, pl.col(f"take_{hop}").is_null(), hop, why)
+        lost_in_buffer = pl.lit(overwritten.implode())
+        reason = pl.when(before.is_in(lost_in_buffer)).then(pl.lit("overwritten")).otherwise(reason)
+    state = _broken(state, pl.col(f"take_{hop}").is_null(), hop, reason)
     return _broken(state, pl.col(f"instance_{hop}").is_null(), hop, pl.lit("not executed"))
 
 
@@ -371,7 +399,7 @@ _SUMMARY += ["broken_hop", "broken_at", "reason"]
 
 
 def _described(flow: DataFlow, chain: Chain, state: pl.DataFrame) -> pl.DataFrame:
-    """The rows of numbers in order, with the columns of ``Traversals.frame``."""
+    """Sort the state by start and add the columns of ``Traversals.frame``."""
     publication = f"publication_{len(chain.topics) - 1}"
     frame = state.with_columns(
         start=_looked_up(flow.instances, "start", "instance_0"),
@@ -390,6 +418,7 @@ def _described(flow: DataFlow, chain: Chain, state: pl.DataFrame) -> pl.DataFram
 
 
 def _hop(flow: DataFlow, chain: Chain, frame: pl.DataFrame, hop: int) -> pl.DataFrame:
+    """Make the rows of ``Traversals.hops`` for one place in the chain."""
     instance, take = f"instance_{hop}", f"take_{hop}"
     sent = _published_at(flow, hop - 1, chain) if hop else pl.lit(None, dtype=pl.Int64)
     via = pl.when(f"sibling_{hop}").then(pl.lit("sibling")).otherwise(pl.lit("instance"))
@@ -427,7 +456,7 @@ def _hop(flow: DataFlow, chain: Chain, frame: pl.DataFrame, hop: int) -> pl.Data
 
 
 def _without_holds(flow: DataFlow, hops: pl.DataFrame) -> pl.DataFrame:
-    """Hops in which what a gate held a message back is waiting, not computation."""
+    """Move the time for which a gate held a message back from computation to waiting."""
     if "gate_release" not in flow.events:
         return hops
     gated = gated_hops(flow.events, flow.objects, hops).select(
@@ -437,14 +466,14 @@ def _without_holds(flow: DataFlow, hops: pl.DataFrame) -> pl.DataFrame:
     until = pl.min_horizontal("let_go", "publish")
     since = pl.max_horizontal("arrival", "start")
     between = pl.when(pl.col("let_go").is_not_null()).then(until - since)
-    held = pl.min_horizontal(between.clip(lower_bound=0).fill_null(0), "computation_ns")
+    hold = pl.min_horizontal(between.clip(lower_bound=0).fill_null(0), "computation_ns")
     return rows.with_columns(
-        computation_ns=pl.col("computation_ns") - held, waiting_ns=pl.col("waiting_ns") + held
+        computation_ns=pl.col("computation_ns") - hold, waiting_ns=pl.col("waiting_ns") + hold
     ).select(hops.columns)
 
 
 def _published_at(flow: DataFlow, hop: int, chain: Chain) -> pl.Expr:
-    """When the hop's message left: for a ring buffer when it was put there, else with DDS."""
+    """When the hop's message left: when it was put into a ring buffer, else when DDS sent it."""
     time = _looked_up(flow.publications, "sent", f"publication_{hop}")
     if hop == len(chain.callbacks) - 1 or not flow.takes["intra_process"].any():
         return time
@@ -454,18 +483,18 @@ def _published_at(flow: DataFlow, hop: int, chain: Chain) -> pl.Expr:
 
 
 def reception(flow: DataFlow, traversals: Traversals, graph: ApplicationGraph) -> pl.DataFrame:
-    """When a callback of the output's subscriber started with each traversal's message.
+    """Make a frame of when a subscriber's callback started with each traversal's output.
 
-    One row per traversal, in order: ``traversal``, ``received`` (null: never) and ``reception_ns``
-    (from the traversal's start). The subscriber is the first subscription callback of the last
-    topic that received anything at all.
+    One row per traversal, in order: ``traversal``; ``received`` (ns, null: never); ``reception_ns``
+    (since the traversal's start). The subscriber is the first subscription callback of the last
+    topic that received a message at all.
     """
     output = traversals.chain.topics[-1]
     candidates = [callback.id for callback in graph.callbacks if callback.trigger == output]
     taken = flow.takes.filter(pl.col("callback_id").is_in(candidates))
     taken = taken.drop_nulls(["publication", "instance"])
     taken = taken.filter(pl.col("callback_id") == pl.col("callback_id").min())
-    # Of several takes the first: what is laid out last stays.
+    # Of several takes the first counts. `by_number` takes the last row, so they are reversed.
     reader = by_number(taken.reverse(), "publication", "instance", flow.publications.height)
     received = flow.instances["start"].gather(reader.gather(traversals.frame["publication"]))
     return traversals.frame.select(

@@ -1,10 +1,10 @@
-"""Messages that subscriptions' callbacks got although no event tells of their takes.
+"""Messages that subscriptions' callbacks got although no event shows their takes.
 
-Loaned messages are taken past the functions that have events, and Foxy and plain Galactic have no
-events of takes at all. The callbacks' events are there. Where one publisher alone writes the topic,
-and one callback starts between a publication and the next, publication and callback determine each
-other, as long as no older message can be waiting: since the publication before, the thread had
-nothing to do for a while, or the messages before are linked without a gap since it last had not.
+Loaned messages are taken by functions that have no events, and Foxy and plain Galactic have no
+events of takes at all. The callbacks' events are there. If a single publisher writes the topic, and
+one callback starts between a publication and the next, the two belong together, provided that no
+older message can be waiting. None is waiting if the thread had nothing to do for a while since the
+publication before, or if all messages since such a pause are linked without a gap.
 """
 
 from dataclasses import dataclass
@@ -16,34 +16,31 @@ from chainshaper.analysis.matching import latest_before
 from chainshaper.analysis.objects import Objects
 from chainshaper.values.application import INTERNAL_TOPICS
 
-_FEWEST = 3  # callbacks, each with a publication of its own, that show that they alternate
-_MOSTLY = 0.5  # of the publications between the first and the last of them
-_WHILE = 0.1  # of the usual distance of the callback's starts: longer than executors take for work
+_FEWEST = 3  # how many linked callbacks show that publications and callbacks alternate
+_MOSTLY = 0.5  # share of the publications, from the first to the last linked, that must be linked
+_WHILE = 0.1  # share of the usual distance of starts: a pause is longer than an executor's work
 
 
 @dataclass(frozen=True)
 class UnseenTakes:
-    """A subscription's callback that ran without any event of a take.
-
-    ``runs`` counts its instances, the first of them at ``first_ns`` in thread ``tid``, ``linked``
-    those whose message is known, ``publishers`` the publishers that wrote the topic.
-    """
+    """A subscription's callback that ran without any event of a take."""
 
     callback_id: int
     node: str
     topic: str
-    tid: int
-    first_ns: int
-    runs: int
-    linked: int
-    publishers: int
+    tid: int  # of the thread of its first instance
+    first_ns: int  # instant of that
+    runs: int  # number of its instances
+    linked: int  # number of those whose message is known
+    publishers: int  # number of publishers that wrote the topic
 
 
 def with_unseen_takes(
     taken: pl.DataFrame, instances: pl.DataFrame, published: pl.DataFrame, objects: Objects
 ) -> tuple[pl.DataFrame, tuple[UnseenTakes, ...]]:
-    """``taken`` with a take at the start of each instance whose message is known, numbered anew,
-    and what is known of the subscriptions without events of takes.
+    """Add a take at the start of each instance whose message is certain, and number takes anew.
+
+    Also return the subscriptions without events of takes.
     """
     listening = objects.callbacks.filter(
         pl.col("observed") & (pl.col("kind") == "subscription") & pl.col("topic").is_not_null()
@@ -55,26 +52,36 @@ def with_unseen_takes(
     bare = bare.filter(~internal)
     if bare.is_empty():
         return taken, ()
-    own = instances.filter(~pl.col("intra_process") & ~pl.col("assumed"))
-    own = own.join(bare.select("callback_id", "node", "topic"), on="callback_id")
-    found, more = [], [taken]
-    for (number,), ran in own.sort("start").group_by("callback_id", maintain_order=True):
+    ran_bare = instances.filter(~pl.col("intra_process") & ~pl.col("assumed"))
+    ran_bare = ran_bare.join(bare.select("callback_id", "node", "topic"), on="callback_id")
+    unseen, parts = [], [taken]
+    for (number,), ran in ran_bare.sort("start").group_by("callback_id", maintain_order=True):
         node, topic, tid, first = ran.select("node", "topic", "tid", "start").row(0)
         written = published.filter(pl.col("topic") == topic)
         publishers, linked = written["publisher"].n_unique(), ran.clear()
         if publishers == 1:
             linked = _linked(ran, written, instances)
-            more.append(_as_takes(linked, ran, taken))
-        about = (node, str(topic), tid, first, ran.height, linked.height, publishers)
-        found.append(UnseenTakes(int(str(number)), *about))
-    if len(more) > 1:
-        taken = pl.concat(more).sort("time", "pid", "tid", maintain_order=True)
+            parts.append(_as_takes(linked, ran, taken))
+        unseen.append(
+            UnseenTakes(
+                callback_id=int(str(number)),
+                node=node,
+                topic=str(topic),
+                tid=tid,
+                first_ns=first,
+                runs=ran.height,
+                linked=linked.height,
+                publishers=publishers,
+            )
+        )
+    if len(parts) > 1:
+        taken = pl.concat(parts).sort("time", "pid", "tid", maintain_order=True)
         taken = taken.drop("take").with_row_index("take")
-    return taken, tuple(found)
+    return taken, tuple(unseen)
 
 
 def _linked(ran: pl.DataFrame, written: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
-    """The rows of ``ran`` of which the publication is certain, with ``publication``."""
+    """Select the rows of ``ran`` whose message is certain, and add its ``publication``."""
     sent, thread = written["time"].to_numpy(), ["pid", "tid"]
     place = np.searchsorted(sent, ran["start"].to_numpy(), side="right") - 1
     counts = np.bincount(place[place >= 0], minlength=len(sent))
@@ -90,7 +97,8 @@ def _linked(ran: pl.DataFrame, written: pl.DataFrame, instances: pl.DataFrame) -
     busy = instances.select(*thread, over, began="start")
     rows = latest_before(rows, busy, thread, "time", "began")
     free = (pl.col("over") <= pl.col("time")) | pl.col("began").is_null()
-    # The thread that reads may publish as well, and have had nothing to do before that.
+    # The thread that reads may publish as well. So the pause may lie before any of its instances
+    # since the publication before.
     usual = float(ran["start"].diff().median() or 0)  # type: ignore[arg-type]
     apart = pl.col("began") - pl.col("over").shift(1).over(thread)
     after_pause = busy.filter((apart > _WHILE * usual).fill_null(True))
@@ -105,7 +113,7 @@ def _linked(ran: pl.DataFrame, written: pl.DataFrame, instances: pl.DataFrame) -
 
 
 def _as_takes(linked: pl.DataFrame, ran: pl.DataFrame, taken: pl.DataFrame) -> pl.DataFrame:
-    """Linked instances as rows of ``taken``: no event says more of these takes."""
+    """Make rows of ``taken`` from linked instances; columns that no event shows are null."""
     about = ran.select("instance", "callback_id", "node", "topic")
     rows = linked.join(about, on="instance").with_columns(
         time=pl.col("start"), intra_process=pl.lit(False)

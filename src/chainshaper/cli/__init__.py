@@ -1,5 +1,7 @@
-"""The command line: each verb a thin coat over a library call; results go to stdout, all else to
-stderr. Exit codes: 0 done, 1 the operation failed, 2 wrong use or input, 3 the platform cannot.
+"""The command line: each verb calls a function of the library and prints what it returns.
+
+Results go to stdout, all else to stderr. Exit codes: 0 done, 1 the operation failed, 2 wrong use or
+bad input, 3 the platform cannot do it.
 """
 
 import codecs
@@ -19,7 +21,7 @@ __all__ = ["main"]
 
 REMEDY = "raise the limit (`ulimit -v`), free memory, or give a smaller input"
 OF_ANALYSIS = ("matplotlib",)
-"""What the extra `analysis` brings, which a robot does without."""
+"""The packages of the extra `analysis`, which robots do not have."""
 _LACK_OF_MEMORY = (
     "cannot allocate memory",
     "failed to map segment",  # the loader, of a library
@@ -27,12 +29,14 @@ _LACK_OF_MEMORY = (
     "could not spawn threads",
     "capacity overflow",
 )
-_FRUGAL = {
+# Environment variables with which libraries start as few threads as they can.
+_FEW_THREADS = {
     "POLARS_MAX_THREADS": "1",
     "POLARS_ASYNC_THREAD_COUNT": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "_RJEM_MALLOC_CONF": "background_thread:false",  # of the allocator in Polars
 }
+# What a terminal without some characters gets in their place.
 _PLAIN = {
     "→": "->",
     "←": "<-",
@@ -67,17 +71,17 @@ def _run(arguments: list[str] | None, name: str) -> None:
     _prepare_output_and_memory()
     _interrupted.clear()
     words = list(sys.argv[1:] if arguments is None else arguments)
-    own = words[: words.index("--")] if "--" in words else words  # behind it is a COMMAND
+    options = words[: words.index("--")] if "--" in words else words  # a COMMAND comes behind it
 
     def fail(message: str, code: int) -> NoReturn:
         """End with the last line of a failed command: for people, or for a script."""
         as_json = json.dumps({"format": 1, "error": message, "exit_code": code})
-        say(as_json if "--json" in own else f"error: {message}")
+        say(as_json if "--json" in options else f"error: {message}")
         sys.exit(code)
 
     try:
         for number in _ENDING:
-            # As chainshaper.__main__ has it for Ctrl-C; what is ignored under nohup stays so.
+            # As chainshaper.__main__ does for Ctrl-C; a signal that nohup ignores stays ignored.
             if signal.getsignal(number) == signal.SIG_DFL:
                 signal.signal(number, _end_in_order)
         from chainshaper.cli.app import USAGE_ERROR, Abort, app
@@ -97,12 +101,13 @@ def _run(arguments: list[str] | None, name: str) -> None:
         remedy = "name a place that you may read and write, or change its permissions"
         fail(f"{error.filename}: permission denied: {remedy}", 2)
     except ModuleNotFoundError as error:
-        lacks = (error.name or "").partition(".")[0]
-        if lacks not in OF_ANALYSIS:
+        package = (error.name or "").partition(".")[0]
+        if package not in OF_ANALYSIS:
             raise
-        fail(f"this needs {lacks}, which is not installed: pip install 'chainshaper[analysis]'", 3)
+        remedy = "pip install 'chainshaper[analysis]'"
+        fail(f"this needs {package}, which is not installed: {remedy}", 3)
     except BaseException as error:  # a panic of Polars is no Exception
-        # Libraries that are not Python make an error of their own of Ctrl-C.
+        # Libraries that are not written in Python raise errors of their own on Ctrl-C.
         if isinstance(error, KeyboardInterrupt) or (
             _interrupted and not isinstance(error, SystemExit)
         ):
@@ -115,17 +120,17 @@ def _run(arguments: list[str] | None, name: str) -> None:
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _interrupted: list[int] = []
-"""The signals that have asked us to end."""
+"""The signals that have asked this process to end."""
 
 
 def _end_in_order(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - a signal handler
-    """Ctrl-C, SIGTERM and a lost terminal end us alike: through every `finally`."""
+    """End the process on Ctrl-C, SIGTERM or a lost terminal alike: through every `finally`."""
     _interrupted.append(number)
     raise KeyboardInterrupt
 
 
 def _exhausted(error: BaseException | None) -> str | None:
-    """The message for lack of memory, or for a panic of Polars; None for every other error."""
+    """Return the message for lack of memory or a panic of Polars; None: it is another error."""
     if isinstance(error, KeyboardInterrupt | SystemExit):
         return None
     seen, link = set[int](), error
@@ -145,19 +150,25 @@ def _exhausted(error: BaseException | None) -> str | None:
 
 
 def _readable(error: UnicodeError) -> tuple[str | bytes, int]:
-    """What a terminal without some character gets instead (LC_ALL=C): one alike, or its escape."""
+    """Replace characters that a terminal has not (LC_ALL=C) by similar ones, or their escapes.
+
+    It is an error handler of `codecs`: it returns the replacement, and where encoding goes on.
+    """
     if not isinstance(error, UnicodeEncodeError):
         raise error
-    wrong = error.object[error.start : error.end]
-    plain = (_PLAIN.get(one) or one.encode("ascii", "backslashreplace").decode() for one in wrong)
-    return "".join(plain), error.end
+    plain = ""
+    for character in error.object[error.start : error.end]:
+        escape = character.encode("ascii", "backslashreplace").decode()
+        plain += _PLAIN.get(character) or escape
+    return plain, error.end
 
 
 def _prepare_output_and_memory() -> None:
-    """Where memory is limited (`ulimit -v`), let a library's abort end us with a message.
+    """Let output be shown by any terminal; where memory is limited (`ulimit -v`), spare it.
 
-    Libraries start as few threads as they can there: each one costs address space, Polars waits for
-    ever for one that it cannot start, and its allocator tries to start one for ever.
+    There a library that aborts ends the process with a message, and libraries start as few threads
+    as they can: each thread costs address space. Polars waits for ever for a thread that it cannot
+    start, and its allocator tries to start one for ever.
     """
     codecs.register_error("readable", _readable)
     for stream in (sys.stdout, sys.stderr):
@@ -165,14 +176,14 @@ def _prepare_output_and_memory() -> None:
             stream.reconfigure(errors="readable")
     if resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY:
         return
-    for name, value in _FRUGAL.items():
+    for name, value in _FEW_THREADS.items():
         os.environ.setdefault(name, value)
     message = f"error: memory ran out in a library: {REMEDY}\n".encode()
 
-    def ended(_: int) -> None:
+    def end(_: int) -> None:
         os.write(2, message)
         os._exit(1)
 
-    handler = ctypes.CFUNCTYPE(None, ctypes.c_int)(ended)
+    handler = ctypes.CFUNCTYPE(None, ctypes.c_int)(end)
     _handlers.append(handler)
     ctypes.CDLL(None).signal(int(signal.SIGABRT), handler)

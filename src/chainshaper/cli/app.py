@@ -30,13 +30,13 @@ _MODULES = (
     ("applying", "threads apply status release doctor"),
 )
 VERBS = {verb: module for module, verbs in _MODULES for verb in verbs.split()}
-"""As `--help` lists them; each is a function in the module that stands with it."""
+"""The module of each verb, which is a function there; in the order in which `--help` lists them."""
 
 _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
 
 def _as_shown(text: str) -> str:
-    """What standard output can show of a text: Typer writes UTF-8 where the locale is ASCII."""
+    """Return what standard output can show of a text: Typer writes UTF-8 in any locale."""
     encoding = sys.stdout.encoding or "utf-8"
     return text.encode(encoding, sys.stdout.errors or "replace").decode(encoding)
 

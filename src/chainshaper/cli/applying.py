@@ -40,9 +40,9 @@ def threads(
     pid = int(where) if where is not None and where.isdecimal() else None
     plan = None if where is None or pid is not None else cs.load_plan(where)
     known = opt.recording_of(recording)
-    found = cs.find_threads(plan if pid is None else pid, known, users=user or ())
-    if out.present(json, threads_json(found), threads_table(found)):
-        out.notes(found.notes)
+    running = cs.find_threads(plan if pid is None else pid, known, users=user or ())
+    if out.present(json, threads_json(running), threads_table(running)):
+        out.notes(running.notes)
 
 
 def apply(
@@ -87,10 +87,11 @@ def apply(
 
     planned = cs.load_plan(plan)
     opt.refuse_bound_alone(max_latency, adapt)
-    how: dict[str, Any] = {"recording": opt.recording_of(recording), "phase_ns": phase}
-    how["users"] = user or ()
+    known = opt.recording_of(recording)
     if dry_run:
-        changes = cs.planned_changes(planned, backend, **how)
+        changes = cs.planned_changes(
+            planned, backend, recording=known, phase_ns=phase, users=user or ()
+        )
         if out.present(json, asdict(changes)):
             for words in changes.commands:
                 out.show_line(shlex.join(words))
@@ -105,6 +106,9 @@ def apply(
             command or (),
             command_stdout=sys.stderr.fileno() if json else None,  # standard output is ours
             back_end=backend,
+            recording=known,
+            phase_ns=phase,
+            users=user or (),
             wait_ns=wait,
             adapt=adapt,
             max_latency_ns=max_latency,
@@ -112,7 +116,6 @@ def apply(
             stop=stop,
             watch=watch,
             progress=report,
-            **how,
         )
     out.present(json, asdict(done.state) | {"exit_code": done.exit_code}, servers_table(done.state))
     out.notes(done.state.notes)
@@ -122,23 +125,26 @@ def apply(
 
 @contextmanager
 def _watching() -> "Iterator[tuple[Callable[[RunState], None], Progress]]":
-    """What shows the state of a run, and progress before: a live table, or a line now and then."""
+    """Yield what shows each state of a run, and the progress before there is one.
+
+    It shows a live table, or without a terminal a line now and then.
+    """
     from chainshaper.reporting.overviews import run_line, servers_table
 
-    seen: int = 0
+    states: int = 0
     show: Any = None
 
     def watch(state: "RunState") -> None:
-        nonlocal seen, show
-        first, seen = seen == 0, seen + 1
-        if first and sys.stderr.isatty():
+        nonlocal states, show
+        is_first, states = states == 0, states + 1
+        if is_first and sys.stderr.isatty():
             stack.pop_all().close()  # the bar makes room for the table
             show = stack.enter_context(out.live(on_stderr=True))
         if show is not None:
             show([servers_table(state)])
-        elif first:
+        elif is_first:
             out.say(f"in force with {state.back_end}: {state.reason}; Ctrl-C ends it")
-        elif seen % LINE_EVERY == 1:
+        elif states % LINE_EVERY == 1:
             out.say(run_line(state))
 
     with ExitStack() as stack:
@@ -161,20 +167,21 @@ def status(
     from chainshaper.reporting.overviews import runs_table, servers_table
     from chainshaper.splicing.shaped_outputs import find_outputs, output_text
 
-    found = find_outputs()
+    shaped = find_outputs()
     if json:
-        out.print_json([asdict(output) for output in found] if outputs else runs_as_json())
+        out.print_json([asdict(output) for output in shaped] if outputs else runs_as_json())
         return
-    for output in found:
+    for output in shaped:
         out.show_line(output_text(output))
     if outputs:
-        if not found:
+        if not shaped:
             out.show_line("no output has a shaping node")
         return
     runs = list(cs.find_runs())
     strays = stray_groups(journal for journal, _ in runs)
     if runs:
-        out.show(runs_table(runs), *(servers_table(one) for _, one in runs if one is not None))
+        states = (state for _, state in runs if state is not None)
+        out.show(runs_table(runs), *map(servers_table, states))
     elif not strays:
         out.show_line("no plan is in force")
     out.notes(line for journal, _ in runs for line in strange_lines(journal))
@@ -251,5 +258,5 @@ def doctor(
 
     with out.progress("examining this machine") as report:
         report(0.0, "watching for stalls")
-        found = cs.examine_machine(watch)
-    out.present(json, machine_json(found), *machine_tables(found))
+        machine = cs.examine_machine(watch)
+    out.present(json, machine_json(machine), *machine_tables(machine))

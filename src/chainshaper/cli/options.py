@@ -49,8 +49,8 @@ def _bands(text: str) -> int | Literal["auto"]:
 
 def _node(text: str) -> NodeChoice:
     if text in ("typed", "component"):
-        said = f"{text} is found out now: write --node cpp, and --type where no recording says it"
-        raise typer.BadParameter(said)
+        reason = f"{text} is found out now: write --node cpp, and --type where no recording says it"
+        raise typer.BadParameter(reason)
     if text not in get_args(NodeChoice):
         raise typer.BadParameter(f"{text!r} is none of {', '.join(get_args(NodeChoice))}")
     choice: NodeChoice = text  # type: ignore[assignment]
@@ -70,8 +70,8 @@ def _share(text: str) -> float:
     except ValueError:
         value = 0.0
     if not 0 < value <= 1:
-        said = f"{text} is no share: write more than 0, at most 1 or 100%, such as 0.4 or 40%"
-        raise typer.BadParameter(said)
+        reason = f"{text} is no share: write more than 0, at most 1 or 100%, such as 0.4 or 40%"
+        raise typer.BadParameter(reason)
     return value
 
 
@@ -83,11 +83,15 @@ PARSERS: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
     "auto|python|cpp": (_node, str),
     "SHARE": (_share, "{:.0%}".format),
 }
-"""What reads and writes the values behind a metavar."""
+"""By metavar: the function that reads a value, and the one that writes a default for the help."""
 
 
 def option(names: str, help_text: str, default: Any = None, **more: Any) -> Any:
-    """An option as a parameter's default; ``...`` where it must be given (:data:`PARSERS`)."""
+    """Return an option as the default of a verb's parameter.
+
+    ``names`` are its names, and behind them its metavar, if any (:data:`PARSERS`). The default
+    ``...`` means that the option must be given.
+    """
     words = names.split()
     metavar = None if words[-1].startswith("-") else words.pop()
     parse, write = PARSERS.get(metavar or "", (None, None))
@@ -97,8 +101,8 @@ def option(names: str, help_text: str, default: Any = None, **more: Any) -> Any:
 
 
 def argument(metavar: str, help_text: str, default: Any = None) -> Any:
-    """An argument as a parameter's default; ``...`` where it must be given."""
-    metavar = metavar.strip("[]").rstrip(".…")  # Click says that it may be left out, or repeated
+    """Return an argument as the default of a verb's parameter; ``...``: it must be given."""
+    metavar = metavar.strip("[]").rstrip(".…")  # Click adds that it may be left out, or repeated
     return typer.Argument(default, metavar=metavar, help=help_text, show_default=False)
 
 
@@ -168,7 +172,7 @@ NODE: NodeChoice = option(
 
 
 def plan_in_force(path: Path | None) -> "cs.Plan | None":
-    """The plan of a file, if one is named."""
+    """Read the plan of a file, if a file is named."""
     return None if path is None else cs.load_plan(path)
 
 
@@ -177,7 +181,7 @@ PLAN_WISHES = (*_WISHES, "modes", "late")  # all that :func:`takes_wishes` knows
 
 
 def wish(name: str, **more: Any) -> Any:
-    """The option of a wish; ``more`` may give it another ``default``."""
+    """Return the option of a wish; ``more`` may give it another ``default``."""
     _, described = get_args(_WISHES[name].type)
     names = described.flag or "--" + name.removesuffix("_ns").replace("_", "-")
     metavar = "DURATION" if name.endswith("_ns") else described.metavar or ""
@@ -206,7 +210,8 @@ _LATE = option(
     " or in the cycle's next slot. Default: publish.",
     rich_help_panel=BANDS,
 )
-_OTHERS: dict[str, tuple[Any, Any]] = {
+# The type and the option of each wish whose own type Typer cannot read, and of the modes.
+_AS_TEXT: dict[str, tuple[Any, Any]] = {
     "modes": (str | None, _MODES),
     "late": (Late | None, _LATE),
     "bands": (str, wish("bands")),  # Typer knows no unions
@@ -231,34 +236,42 @@ def takes_wishes(*names: str) -> Callable[[Callable[..., None]], Any]:
             verb(**values, request=cs.PlanRequest(**wished, modes=modes))
 
         parameters: list[Parameter] = []
-        for one in signature(verb).parameters.values():
-            if one.name != "request":
-                parameters.append(one.replace(kind=Parameter.KEYWORD_ONLY))
+        for parameter in signature(verb).parameters.values():
+            if parameter.name != "request":
+                parameters.append(parameter.replace(kind=Parameter.KEYWORD_ONLY))
                 continue
             for name in names:
-                kind, default = _OTHERS.get(name) or (get_args(_WISHES[name].type)[0], wish(name))
-                own = one.replace(name=name, default=default, annotation=kind)
-                parameters.append(own.replace(kind=Parameter.KEYWORD_ONLY))
+                if name in _AS_TEXT:
+                    annotation, default = _AS_TEXT[name]
+                else:
+                    annotation, default = get_args(_WISHES[name].type)[0], wish(name)
+                parameters.append(
+                    Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+                )
         called.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
-        called.__annotations__ = {one.name: one.annotation for one in parameters}
+        called.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
         return called
 
     return decorate
 
 
 def mode_profiles(given: list[str] | None, request: "cs.PlanRequest") -> dict[str, str]:
-    """What `--mode-profile` names for each mode. Raises InputError: it is not of that form."""
-    pairs = [one.partition("=") for one in given or ()]
+    """Return the recording or file that `--mode-profile` names for each mode.
+
+    Raises InputError: a text is not of the form MODE=REC, or there are no modes.
+    """
+    pairs = [text.partition("=") for text in given or ()]
     if not all(request.modes is not None and place for _, _, place in pairs):
         raise InputError("--mode-profile goes with --modes, as MODE=REC: correct one of the two")
     return {mode: place for mode, _, place in pairs}
 
 
 def modes_of(text: str | None, late: Late | None) -> "Modes | None":
-    """The modes that `--modes` names, such as ``/mode:city=2,highway=1``; the first is the default.
-    Without numbers bands have those of the modes' order.
+    """Return the modes that `--modes` names, such as ``/mode:city=2,highway=1``.
 
-    Raises InputError: it is not of this form, or names what no mode or topic may be called.
+    The first mode is the default. Without numbers the bands are numbered in the order of the modes.
+
+    Raises InputError: the text is not of this form, or a name in it no mode or topic may have.
     """
     if text is None:
         if late is not None:
@@ -284,16 +297,18 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
 
 
 def recording_of(named: Path | None, plan: "cs.Plan | None" = None) -> "cs.Recording | None":
-    """The recording that an option names, or else the first of the plan's own that is still there,
-    whichever chain it was made for.
+    """Open the recording that an option names, or else one that the plan was made from.
+
+    Of several chains it is the first recording that is still there. None: there is none.
     """
-    chains = () if plan is None else plan.chains
-    own = (Path(path) for one in chains if (path := one.evidence.recording) is not None)
-    named = named or next((path for path in own if path.is_dir()), None)
+    for chain_plan in () if plan is None else plan.chains:
+        recorded = chain_plan.evidence.recording
+        if named is None and recorded is not None and Path(recorded).is_dir():
+            named = Path(recorded)
     return None if named is None else cs.open_source(named)
 
 
 def refuse_bound_alone(max_latency_ns: int | None, adapt: bool) -> None:
-    """Refuse a bound for slots that stay where they are. Raises InputError."""
+    """Refuse a bound for slots that do not follow the latencies. Raises InputError."""
     if max_latency_ns is not None and not adapt:
         raise InputError("--max-latency bounds slots that follow the latencies: add --adapt")

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 
-PATIENCE_S = 2.0  # what takes longer than this shows its progress
+PATIENCE_S = 2.0  # work that takes longer than this shows its progress
 
 
 def show(*tables: "RenderableType") -> None:
-    """Tables on stdout; in a file or a pipe without colour, and not folded to no width."""
+    """Print tables on stdout; into a file or a pipe without colour, 120 columns wide."""
     from rich.console import Console
 
     console = Console() if sys.stdout.isatty() else Console(width=120)
@@ -32,20 +32,20 @@ def show(*tables: "RenderableType") -> None:
 
 
 def show_line(text: str | Path) -> None:
-    """A line on stdout, or several, as they are: a path must not be folded."""
+    """Print a line on stdout, or several, as they are: a path must not be folded."""
     with _written():
         sys.stdout.write(shown(str(text), but="\n") + "\n")
 
 
 def print_json(value: Any, *, indent: int | None = 2) -> None:
-    """One JSON document on stdout, out at once; without an indent it is a line."""
-    text = json.dumps(value, indent=indent).replace("\x7f", "\\u007f")  # JSON leaves it alone
+    """Print one JSON document on stdout, and flush it; without an indent it is one line."""
+    text = json.dumps(value, indent=indent).replace("\x7f", "\\u007f")  # `json` does not escape it
     with _written():
         sys.stdout.write(text + "\n")
 
 
 def present(as_json: bool, value: Any, *tables: "RenderableType") -> bool:
-    """A value as JSON, or the same as tables; whether it was the tables."""
+    """Print a value as JSON, or the same as tables; return whether as tables."""
     if as_json:
         print_json(value)
     elif tables:
@@ -55,14 +55,14 @@ def present(as_json: bool, value: Any, *tables: "RenderableType") -> bool:
 
 @contextmanager
 def _written() -> Iterator[None]:
-    """What is printed inside is out, or the command fails: a redirection to a full disk."""
+    """Flush what is printed inside, or fail: the output may go to a file on a full disk."""
     try:
         yield
         sys.stdout.flush()
     except BrokenPipeError:
-        raise  # `chainshaper … | head`: Typer ends us quietly
+        raise  # `chainshaper … | head`: Typer ends the command quietly
     except OSError as error:
-        # What could not be written would be tried again, and complained about, at exit.
+        # Else Python would try to write the rest again at exit, and complain.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise OperationError(
             f"standard output cannot be written ({error.strerror}): send it somewhere else"
@@ -70,12 +70,12 @@ def _written() -> Iterator[None]:
 
 
 def say(text: str) -> None:
-    """A message on stderr."""
+    """Print a message on stderr."""
     sys.stderr.write(shown(text, but="\n") + "\n")
 
 
 def notes(lines: Iterable[str]) -> None:
-    """What a reader of the figures must know, one line each, on stderr."""
+    """Print what a reader of the figures must know on stderr, a line each."""
     for line in lines:
         say(f"note: {line}")
 
@@ -89,7 +89,7 @@ def warn(plan: "cs.Plan") -> None:
 
 @contextmanager
 def progress(title: str) -> Iterator[Progress]:
-    """A progress bar on stderr; without a terminal one line per stage instead."""
+    """Show a progress bar on stderr; without a terminal one line per stage instead."""
     if not sys.stderr.isatty():
         yield stage_lines(title)
         return
@@ -104,14 +104,14 @@ def progress(title: str) -> Iterator[Progress]:
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(shown(title), total=1.0)
-        yield lambda share, what: bar.update(
-            task, completed=min(1.0, share), description=shown(f"{title}: {what}")
+        yield lambda share, stage: bar.update(
+            task, completed=min(1.0, share), description=shown(f"{title}: {stage}")
         )
 
 
 @contextmanager
 def late_progress(title: str) -> Iterator[Progress]:
-    """As :func:`progress`, but nothing is shown of what is over in two seconds."""
+    """Show progress as :func:`progress` does, unless the work is over in two seconds."""
     latest = (0.0, "working")
     bar: Progress | None = None
 
@@ -120,11 +120,11 @@ def late_progress(title: str) -> Iterator[Progress]:
         bar = stack.enter_context(progress(title))
         bar(*latest)
 
-    def report(share: float, what: str) -> None:
+    def report(share: float, stage: str) -> None:
         nonlocal latest
-        latest = (share, what)
+        latest = (share, stage)
         if bar is not None:
-            bar(share, what)
+            bar(share, stage)
 
     timer = threading.Timer(PATIENCE_S, begin)
     timer.daemon = True
@@ -138,41 +138,46 @@ def late_progress(title: str) -> Iterator[Progress]:
 
 
 def stage_lines(title: str) -> Progress:
-    """Progress as one line per stage, for where a bar would disturb what others print."""
+    """Show progress as one line per stage, where a bar would disturb what others print."""
     last = ""
 
-    def report(_: float, what: str) -> None:
+    def report(_: float, stage: str) -> None:
         nonlocal last
-        if what != last:
-            say(f"{title}: {what}")
-            last = what
+        if stage != last:
+            say(f"{title}: {stage}")
+            last = stage
 
     return report
 
 
 @contextmanager
 def opened(verb: str, trace: Sequence[Path]) -> "Iterator[tuple[cs.Recording, Progress]]":
-    """A trace or recording for a verb that reads it, and what reports the verb's progress."""
+    """Open a trace or recording for a verb; yield it with what reports the verb's progress."""
     with late_progress(verb) as report:
         yield cs.open_source(*trace, progress=report), report
 
 
 def lost_events(recording: "cs.Recording") -> str:
-    """What was lost while recording; "nothing" is said as well."""
+    """Return a text about the events that were lost while recording, also if none was."""
     from chainshaper.values.recording import lost_text
 
     return lost_text(recording.info.lost)
 
 
 def stop_on_signals() -> AbstractContextManager[threading.Event]:
-    """Ctrl-C, a closed terminal and `kill` are an order to finish inside: each sets the event."""
-    nohup = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
-    return set_by(signal.SIGINT, signal.SIGTERM, *(() if nohup else (signal.SIGHUP,)))
+    """Yield an event that Ctrl-C, a closed terminal or `kill` sets: an order to finish."""
+    orders = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as it is under nohup
+        orders.append(signal.SIGHUP)
+    return set_by(*orders)
 
 
 @contextmanager
 def set_by(*numbers: signal.Signals) -> Iterator[threading.Event]:
-    """An event that these signals set, by a thread: a handler may interrupt who has its lock."""
+    """Yield an event that these signals set.
+
+    A thread sets it: the handler itself may interrupt a function that has the event's lock.
+    """
     event, (reading, writing) = threading.Event(), os.pipe()
 
     def listen() -> None:
@@ -181,18 +186,20 @@ def set_by(*numbers: signal.Signals) -> Iterator[threading.Event]:
         os.close(reading)
 
     threading.Thread(target=listen, daemon=True).start()
-    before = {one: signal.signal(one, lambda *_: os.write(writing, b"!")) for one in numbers}
+    handlers = {
+        number: signal.signal(number, lambda *_: os.write(writing, b"!")) for number in numbers
+    }
     try:
         yield event
     finally:
-        for number, handler in before.items():
+        for number, handler in handlers.items():
             signal.signal(number, handler)
         os.close(writing)
 
 
 @contextmanager
 def live(*, on_stderr: bool = False) -> "Iterator[Callable[[Sequence[RenderableType]], None]]":
-    """Tables that take the place of those before, on a terminal; else they follow each other."""
+    """Yield what shows tables: on a terminal in place of those before, else behind them."""
     if not (on_stderr or sys.stdout.isatty()):
         yield lambda tables: show(*tables)
         return

@@ -3,13 +3,16 @@
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import chainshaper as cs
 from chainshaper.cli import options as opt
 from chainshaper.cli import output as out
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Fallback, NodeChoice
+
+if TYPE_CHECKING:
+    from chainshaper.planning import BandChoice
 
 
 @opt.takes_wishes(*opt.PLAN_WISHES)
@@ -54,10 +57,8 @@ def plan(
     From a recording, or from bare latencies with their period.
     """
     from chainshaper import planning
-    from chainshaper.linux.scheduling import available_cores
-    from chainshaper.planning.profile import deciding_cycles, doubts_about
     from chainshaper.planning.request import on_cores
-    from chainshaper.reporting import figures, overviews
+    from chainshaper.reporting import figures
     from chainshaper.verify.measure import taken_chain
 
     if convert is not None:
@@ -67,19 +68,23 @@ def plan(
         raise InputError("give either a recording or --latencies FILE --period DURATION")
     _check_curve(curve, request)
     wanted: list[str | None] = [*chain] if chain else [None]
-    how: dict[str, Any] = {"modes": request.modes, "since_ns": since, "until_ns": until}
-    how["mode_recordings"] = opt.mode_profiles(mode_profile, request)
+    mode_recordings = opt.mode_profiles(mode_profile, request)
     source = None if recording is None else cs.open_source(recording)
-    profiles = _profiles(source, latencies, period, [*wanted, *(sink or [])], how)
+    if source is not None:
+        profiles = cs.profile_chains(
+            source,
+            [*wanted, *(sink or [])],
+            period_ns=period,
+            modes=request.modes,
+            mode_recordings=mode_recordings,
+            since_ns=since,
+            until_ns=until,
+        )
+    else:
+        profiles = _profile_of_latencies(latencies, period, [*wanted, *(sink or [])], since, until)
     planned, sinks = profiles[: len(wanted)], profiles[len(wanted) :]
     taken = () if source is None else taken_chain(source, wanted[0], planned[0].spec or "")
-    doubts = [] if request.percentile else [*filter(None, map(deciding_cycles, profiles))]
-    doubts += taken
-    doubts += dict.fromkeys(doubt for profile in profiles for doubt in doubts_about(profile))
-    doubts += [
-        f"this machine has no core {core}, as --cores wants it: the plan is for another machine"
-        for core in sorted({*(request.cores or ())} - {*available_cores()})
-    ]
+    doubts = _doubts_about(profiles, taken, request)
     if len(planned) > 1:
         if sinks:
             raise InputError("--sink goes with one chain: name the other output with --chain, too")
@@ -88,25 +93,60 @@ def plan(
         joint, remarks = planning.plan_application(planned, request)
         _print_several(joint.chains, remarks + doubts, output, json)
         return
-    made = cs.plan_chain(planned[0], request, sinks)
-    of_auto = request.bands == "auto"
-    choice = planning.band_choice(made, planned[0], request, sinks) if of_auto else None
+    chain_plan = cs.plan_chain(planned[0], request, sinks)
+    choice = None
+    if request.bands == "auto":
+        choice = planning.band_choice(chain_plan, planned[0], request, sinks)
     if output is not None:
-        cs.save_plan(cs.Plan.of(made), output)
-    warnings = [*on_cores(profiles, request)[1], *doubts, *planning.plan_warnings(made)]
-    values: dict[str, Any] = {**planning.plan_json(made), "warnings": warnings}
-    tables = [overviews.plan_table(made)]
-    if len(planning.publish_slots(made)) > 1 or made.modes is not None:
-        tables.append(overviews.bands_table(made))
+        cs.save_plan(cs.Plan.of(chain_plan), output)
+    warnings = [*on_cores(profiles, request)[1], *doubts, *planning.plan_warnings(chain_plan)]
+    if choice is not None and curve is not None:
+        figures.draw_curve(choice, curve)
+    if _print_plan(chain_plan, choice, warnings, json):
+        for path in filter(None, (curve, output)):
+            out.show_line(path)
+
+
+def _doubts_about(
+    profiles: "Sequence[cs.Profile]", taken: Sequence[str], request: "cs.PlanRequest"
+) -> list[str]:
+    """Return what is doubtful about plans from these profiles, a sentence each.
+
+    ``taken`` are the notes about the chain that was taken since none was named.
+    """
+    from chainshaper.linux.scheduling import available_cores
+    from chainshaper.planning.profile import deciding_cycles, doubts_about
+
+    doubts: list[str] = []
+    if not request.percentile:
+        doubts += filter(None, map(deciding_cycles, profiles))
+    doubts += taken
+    doubts += dict.fromkeys(doubt for profile in profiles for doubt in doubts_about(profile))
+    doubts += [
+        f"this machine has no core {core}, as --cores wants it: the plan is for another machine"
+        for core in sorted({*(request.cores or ())} - {*available_cores()})
+    ]
+    return doubts
+
+
+def _print_plan(
+    chain_plan: "cs.ChainPlan", choice: "BandChoice | None", warnings: Sequence[str], json: bool
+) -> bool:
+    """Print the plan of a chain, and how its bands were chosen; return whether as tables."""
+    from chainshaper import planning
+    from chainshaper.reporting import overviews
+
+    values: dict[str, Any] = {**planning.plan_json(chain_plan), "warnings": [*warnings]}
+    tables = [overviews.plan_table(chain_plan)]
+    if len(planning.publish_slots(chain_plan)) > 1 or chain_plan.modes is not None:
+        tables.append(overviews.bands_table(chain_plan))
     if choice is not None:
         values["choice"] = overviews.choice_json(choice)
         tables.append(overviews.choice_table(choice))
-        if curve is not None:
-            figures.draw_curve(choice, curve)
-    if out.present(json, values, *tables):
+    as_tables = out.present(json, values, *tables)
+    if as_tables:
         out.notes(warnings)
-        for path in filter(None, (curve, output)):
-            out.show_line(path)
+    return as_tables
 
 
 def _check_curve(curve: Path | None, request: "cs.PlanRequest") -> None:
@@ -130,23 +170,22 @@ def _convert(earlier: Path, output: Path | None, json: bool, *, alone: bool) -> 
         out.show_line(output)
 
 
-def _profiles(
-    recording: "cs.Recording | None",
+def _profile_of_latencies(
     latencies: Path | None,
     period: int | None,
     chains: Sequence[str | None],
-    how: dict[str, Any],
+    since_ns: int,
+    until_ns: int | None,
 ) -> "tuple[cs.Profile, ...]":
+    """Return the profile of one chain from a file of its latencies, a period apart."""
     from chainshaper.planning import read_latencies
 
-    if recording is not None:
-        return cs.profile_chains(recording, chains, period_ns=period, **how)
     if latencies is None or period is None:
         raise InputError("--latencies needs the chain's period: add --period, such as 100ms")
     if len(chains) > 1:
         raise InputError("--latencies are those of one chain: give a recording for several")
-    begin, end = how["since_ns"], how["until_ns"]
-    first, last = -(-begin // period), end and -(-end // period)  # periods, rounded up
+    # In periods, rounded up.
+    first, last = -(-since_ns // period), until_ns and -(-until_ns // period)
     return (cs.Profile(read_latencies(latencies)[first:last], period, spec=chains[0]),)
 
 
@@ -176,7 +215,7 @@ def offsets(
 def _print_several(
     placed: "Sequence[cs.ChainPlan]", remarks: Sequence[str], output: Path | None, json: bool
 ) -> None:
-    """Plans of several chains, written as one plan of all, or into a folder with a plan each."""
+    """Write the plans of several chains, as one plan or a folder with a plan each; print them."""
     from chainshaper import planning
     from chainshaper.planning.plan import Plan
     from chainshaper.planning.several_chains import with_own_names
@@ -321,52 +360,73 @@ def splice(
         raise InputError("--node python needs no building: leave out --build, or choose another")
     if build and language_of(node, builds=True)[0] == "cpp":
         check_build_tools()  # before anything is written
-    words = [*([str(plan)] if throttle and plan is not None else []), *(launch or [])]
+    words = launch or []
+    # With --throttle there is no plan: the first word is a launch file, too.
+    words = [str(plan), *words] if throttle and plan is not None else words
     ran = words[:2] == ["ros2", "run"]
     arguments = {} if ran else dict(word.split(":=", 1) for word in words if ":=" in word)
     files = words if ran else [word for word in words if ":=" not in word]
-    common: dict[str, Any] = {"launch_files": files, "output": output, "node": node}
-    common |= {"builds": build}
-    common |= {"arguments": arguments, "dry_run": dry_run}
     if throttle:
         if fallback is not None:
             raise InputError("a throttler has no fallback: --fallback goes with a plan")
         if message_type is not None:
             raise InputError("a throttler is for all types: leave out --type")
         if not files:
-            said = "give the launch files: `splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`"
-            raise InputError(said)
-        known = opt.recording_of(recording)
-        splicing = cs.splice_throttlers(throttled_inputs(throttle), recording=known, **common)
+            usage = "`splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`"
+            raise InputError(f"give the launch files: {usage}")
+        splicing = cs.splice_throttlers(
+            throttled_inputs(throttle),
+            files,
+            output,
+            node=node,
+            builds=build,
+            arguments=arguments,
+            recording=opt.recording_of(recording),
+            dry_run=dry_run,
+        )
     elif plan is None or not files:
         raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
     else:
         planned = cs.load_plan(plan)
         out.warn(planned)
-        common |= {"message_type": message_type, "fallback": fallback}
-        known = opt.recording_of(recording, planned)
-        splicing = cs.splice_launch_files(planned, recording=known, **common)
-    packages = any(process.package is not None for process in splicing.processes)
-    built = build and not dry_run and packages
-    setup = build_package(splicing.folder / NODES) if built else None
+        splicing = cs.splice_launch_files(
+            planned,
+            files,
+            output,
+            node=node,
+            builds=build,
+            arguments=arguments,
+            message_type=message_type,
+            recording=opt.recording_of(recording, planned),
+            fallback=fallback,
+            dry_run=dry_run,
+        )
+    has_packages = any(process.package is not None for process in splicing.processes)
+    setup = None
+    if build and not dry_run and has_packages:
+        setup = build_package(splicing.folder / NODES)
     if out.present(json, _splicing_json(splicing, setup)):
         _show_splicing(splicing, arguments, setup, dry_run=dry_run)
 
 
 def throttled_inputs(inputs: Sequence[str]) -> "list[cs.ThrottledInput]":
-    """Inputs as they are written: ``/fusion:/points_raw=100ms``, ``/points_raw=100ms,first``."""
+    """Parse inputs to be throttled: ``/fusion:/points_raw=100ms``, ``/points_raw=100ms,first``.
+
+    Raises InputError: a text is not of this form.
+    """
     from chainshaper.values.durations import parse_duration
     from chainshaper.values.yaml_file import wrong_values_refused
 
     parsed = []
     for text in inputs:
-        where, equals, how = text.rpartition("=")
-        period, comma, rule = how.partition(",")
+        where, equals, rhythm = text.rpartition("=")
+        period, comma, rule = rhythm.partition(",")
         if not equals:
             raise InputError(f"--throttle {text}: write a topic and a period: /points_raw=100ms")
         node, _, topic = where.rpartition(":")
         values = {"topic": topic, "period_ns": parse_duration(period), "subscriber": node or None}
-        values |= {"rule": rule} if comma else {}
+        if comma:
+            values["rule"] = rule
         with wrong_values_refused(cs.ThrottledInput):
             parsed.append(cs.ThrottledInput.model_validate(values))
     return parsed
@@ -375,18 +435,21 @@ def throttled_inputs(inputs: Sequence[str]) -> "list[cs.ThrottledInput]":
 def _show_splicing(
     splicing: "cs.Splicing", arguments: dict[str, str], setup: Path | None, *, dry_run: bool
 ) -> None:
-    for one in splicing.redirects:
-        verb = "publishes" if one.kind == "publisher" else "subscribes to"
-        for node in one.nodes:
-            out.show_line(f"{node} {verb} {one.target} in place of {one.topic}, for {one.added[0]}")
+    for redirect in splicing.redirects:
+        verb = "publishes" if redirect.kind == "publisher" else "subscribes to"
+        instead = f"{redirect.target} in place of {redirect.topic}, for {redirect.added[0]}"
+        for node in redirect.nodes:
+            out.show_line(f"{node} {verb} {instead}")
     if splicing.environment and dry_run:
         out.show_line("what is launched would get the gate")
     elif splicing.environment:
         loads = [f"{key}={value}" for key, value in splicing.environment.items()]
         out.show_line("what is launched gets the gate; what starts otherwise, as a service, by:")
         out.show_line(shlex.join(["env", *loads, "COMMAND"]))
-    for started in (one for found in splicing.redirected for one in found["redirected"]):
-        out.show_line(f"would add to {started['as']}: {' '.join(started['rules']) or 'nothing'}")
+    for looked_at in splicing.redirected:
+        for started in looked_at["redirected"]:
+            rules = " ".join(started["rules"]) or "nothing"
+            out.show_line(f"would add to {started['as']}: {rules}")
     out.notes(splicing.notes)
     if dry_run:
         return
@@ -403,11 +466,13 @@ def _splicing_json(splicing: "cs.Splicing", setup: Path | None) -> dict[str, Any
         "launch": {str(file): str(copy) for file, copy in splicing.launch.items()},
         "originals": {str(copy): str(file) for copy, file in splicing.originals.items()},
         "nodes": [process.name for process in splicing.processes],
-        "standbys": [one.standby.name for one in splicing.processes if one.standby is not None],
+        "standbys": [
+            process.standby.name for process in splicing.processes if process.standby is not None
+        ],
         "logs": [str(log) for log in splicing.logs],
         "setup": None if setup is None else str(setup),
         "environment": dict(splicing.environment),
-        "redirected": [dict(one) for one in splicing.redirected],
+        "redirected": [dict(looked_at) for looked_at in splicing.redirected],
         "diff": splicing.diff,
         "notes": list(splicing.notes),
     }

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from chainshaper.values.application import ApplicationGraph
 
 STDERR = 2
-PATIENCE_NS = 10_000_000_000  # after nodes are there `watch` names what has not run of a budget
-MOST_JUDGED = 100_000  # simulated cycles, which are read again for that: more take memory
+PATIENCE_NS = 10_000_000_000  # after nodes are there `watch` names what of a budget has not run
+MOST_JUDGED = 100_000  # simulated cycles: they are read again to be judged, which takes memory
 MOST_RECORDED = 100  # by `watch --budget` itself: a limit that breaks for weeks fills no disk
 
 COMMAND: list[str] | None = opt.argument(
@@ -81,7 +81,7 @@ def demo(
             planned=out.warn,
             progress=report,
         )
-    before, after = (one.recording for one in compared.measurements)
+    before, after = (measurement.recording for measurement in compared.measurements)
     flow = cs.data_flow(before.events, before.info.clock_offset_ns)
     tables = [callback_table(cs.callback_statistics(flow))]
     tables += [
@@ -171,8 +171,9 @@ def simulate(
         )
         judged = plan is not None and cycles <= MOST_JUDGED
         comparisons = cs.compare_chains([recording], least=1) if judged else ()
-    for one in comparisons:
-        out.notes([f"{one.chain}: {verdict(measured)[1]}" for measured in one.measurements])
+    for comparison in comparisons:
+        for measurement in comparison.measurements:
+            out.notes([f"{comparison.chain}: {verdict(measurement)[1]}"])
     out.show_line(recording.path)
 
 
@@ -324,13 +325,8 @@ def watch(
             out.show_line(f"export {name}={shlex.quote(value)}")
         return
     known = opt.plan_in_force(plan)
-    specs = () if known is None else (one.chain.spec for one in known.chains)
     limits = Budget() if budget is None else load_budget(budget)
-    chains = dict.fromkeys((*(chain or filter(None, specs)), *(one.chain for one in limits.chains)))
-    if not chains:
-        raise InputError(
-            "no chain is named: give --chain FIRST..LAST, such as /t1../t5, or --plan or --budget"
-        )
+    chains = _chains_to_watch(chain or [], known, limits)
     if budget is not None or recorder != Path():
         refuse_existing(recorder / "watch-DATE-TIME")
     if command:
@@ -345,7 +341,7 @@ def watch(
         export = until.enter_context(exporting(metrics, otlp))
         asked = until.enter_context(out.set_by(signal.SIGQUIT))
         watched = Watch(
-            list(chains),
+            chains,
             users=run_users(user or []),
             plan=known,
             longest_ns=longest,
@@ -359,10 +355,10 @@ def watch(
                 asked.clear()
                 _save(watched, recorder)
             if (late := time.monotonic_ns() - next_look) >= 0:
-                next_look += (1 + late // every) * every  # none is made up for
+                next_look += (1 + late // every) * every  # looks that were missed are left out
                 out.notes(export(seen := watched.look()))
                 publish(seen)
-                broken = [one.text for one in judged(seen)]
+                broken = [limit.text for limit in judged(seen)]
                 if json:
                     out.print_json(seen.as_json() | {"broken": broken}, indent=None)
                 else:
@@ -371,10 +367,25 @@ def watch(
         raise OperationError(f"the command {own_processes.end_in_words(started.returncode)}")
 
 
+def _chains_to_watch(
+    chains: "Sequence[str]", plan: "cs.Plan | None", limits: "Budget"
+) -> list[str]:
+    """Return the chains that are named, or else those of the plan; and those that have limits."""
+    specs = [*chains]
+    if not specs and plan is not None:
+        specs = [spec for chain_plan in plan.chains if (spec := chain_plan.chain.spec)]
+    specs += [of_chain.chain for of_chain in limits.chains]
+    if not specs:
+        raise InputError(
+            "no chain is named: give --chain FIRST..LAST, such as /t1../t5, or --plan or --budget"
+        )
+    return list(dict.fromkeys(specs))
+
+
 def _judging(
     limits: "Budget", watched: "Watch", recorder: Path
 ) -> "Callable[[Seen], list[Judged]]":
-    """What finds the limits that are broken; new ones are written to stderr and recorded."""
+    """Return what finds the broken limits at a look; it reports and records those newly broken."""
     from chainshaper.monitor.budgets import broken_limits, not_running
 
     breaks, named_at, left = set[tuple[str, str]](), 0, MOST_RECORDED
@@ -382,8 +393,8 @@ def _judging(
     def judged(seen: "Seen") -> "list[Judged]":
         nonlocal breaks, named_at, left
         broken = broken_limits(limits, seen)
-        new = [one.text for one in broken if (one.where, one.what) not in breaks]
-        breaks = {(one.where, one.what) for one in broken}
+        new = [limit.text for limit in broken if (limit.where, limit.what) not in breaks]
+        breaks = {(limit.where, limit.what) for limit in broken}
         if new:
             out.say("; ".join(new))
             if left > 0:
@@ -402,7 +413,7 @@ def _judging(
 
 
 def _save(watched: "Watch", recorder: Path, reasons: "Sequence[str]" = ()) -> None:
-    """Have the flight recorder write; that it cannot is no reason to stop watching."""
+    """Have the flight recorder write; if it cannot, say so, and go on watching."""
     name = f"watch-{datetime.now():%Y%m%d-%H%M%S}"
     try:
         for number in count(1):  # another watch may have taken the name
@@ -420,7 +431,7 @@ def _save(watched: "Watch", recorder: Path, reasons: "Sequence[str]" = ()) -> No
 
 
 def _publisher(watched: "Watch", until: ExitStack) -> "Callable[[Seen], None]":
-    """What publishes `/diagnostics`, with the ROS 2 of the first node that is seen."""
+    """Return what publishes a look on `/diagnostics`, with the ROS 2 of the first node seen."""
     from chainshaper.sources.ros import environment_of, publishing_diagnostics
 
     publish: Callable[[Sequence[Mapping[str, Any]]], str | None] | None = None
@@ -498,11 +509,11 @@ def profile(
     if len(cores) > 1 and not (earlier and chains):
         raise InputError("--cores are distributed by what chains do: add --chain and --like")
     core_of = {f"/{name.strip('/')}": cores[0] for name in node or ()}
-    seen = tuple["cs.Profile", ...]()
+    profiles = tuple["cs.Profile", ...]()
     if earlier is not None and chains:
-        seen, found = profiled_cores(earlier, chains, request)
-        core_of |= found
-        if len(undelayed(seen, found)) > 1:
+        profiles, of_chains = profiled_cores(earlier, chains, request)
+        core_of |= of_chains
+        if len(undelayed(profiles, of_chains)) > 1:
             out.notes(["chains that share a core delay each other here: profile them one by one"])
     if request.best_effort and not core_of:
         raise InputError("--best-effort is beside a chain: add --chain and --like, or --node")
@@ -518,7 +529,7 @@ def profile(
                 core_of,
                 core_of or cores[0],
                 like=earlier,
-                best_effort=best_effort_cores(seen, request, core_of),
+                best_effort=best_effort_cores(profiles, request, core_of),
                 policy=request.policy,
             ),
             watch_stalls=True,
@@ -634,7 +645,7 @@ def shape(
 
 
 def _show_shaped_recording(recording: "cs.Recording", *, strict: bool) -> None:
-    """Show what a recording of a described application shows of its gates, and judge it."""
+    """Show what gates did in a recording of a described application, and judge it."""
     from chainshaper.verify.overruns import dropped_text, overruns_text
 
     comparisons = cs.compare_chains([recording], least=1)
@@ -666,11 +677,12 @@ def _show_shaped_launch(shaped: "cs.ShapedLaunch", *, strict: bool, json: bool) 
     judge(shaped.comparisons, strict=strict, json=json)
 
 
-def _ask(graph: "ApplicationGraph", found: "ChainEnumeration") -> str:
+def _ask(graph: "ApplicationGraph", listed: "ChainEnumeration") -> str:
+    """Ask the user which of the listed chains to shape."""
     from chainshaper.reporting.overviews import chain_table
     from chainshaper.values.errors import shown
 
-    out.show(chain_table(graph, found))
-    default = (found.heaviest or found.chains[0]).spec
+    out.show(chain_table(graph, listed))
+    default = (listed.heaviest or listed.chains[0]).spec
     question = f"Which chain, FIRST..LAST? [{shown(default)}]"
     return str(typer.prompt(question, default=default, show_default=False, err=True))

@@ -32,7 +32,7 @@ def info(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
         contents = overviews.contents_json(recording, contradictions)
     if out.present(json, contents, *overviews.contents_table(recording)):
         out.show_line(out.lost_events(recording))
-        out.notes((*contents["notes"], *(each.note for each in contradictions)))
+        out.notes((*contents["notes"], *(contradiction.note for contradiction in contradictions)))
 
 
 def describe(
@@ -97,12 +97,13 @@ def callbacks(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
 
     with out.opened("callbacks", trace) as (recording, _):
         flow = recorded_flow(recording)
-        found = cs.callback_statistics(flow)
-    if out.present(json, overviews.callback_rows(found), overviews.callback_table(found)):
+        statistics = cs.callback_statistics(flow)
+    rows, table = overviews.callback_rows(statistics), overviews.callback_table(statistics)
+    if out.present(json, rows, table):
         out.show_line(out.lost_events(recording))
         out.notes((*recording.info.notes, *flow.notes))
-    else:  # the array has no place for them
-        out.notes(one.note for one in flow.contradictions)
+    else:  # the JSON is an array, which has no place for notes
+        out.notes(contradiction.note for contradiction in flow.contradictions)
         if any(recording.info.lost.values()):
             out.notes([out.lost_events(recording)])
 
@@ -128,12 +129,12 @@ def chains(
     with out.opened("chains", trace) as (recording, report):
         flow = recorded_flow(recording)
         report(0.9, "searching chains")
-        application, found = graph_of(flow), cs.list_chains(flow, start, end, limit)
+        application, listed = graph_of(flow), cs.list_chains(flow, start, end, limit)
     remarks = [*recording.info.notes, *flow.notes]
-    values = overviews.chains_json(application, found)
+    values = overviews.chains_json(application, listed)
     values |= {"lost": recording.info.lost, "notes": remarks}
-    if out.present(json, values, overviews.chain_table(application, found)):
-        out.show_line(f"{overviews.count_text(found)}; {out.lost_events(recording)}")
+    if out.present(json, values, overviews.chain_table(application, listed)):
+        out.show_line(f"{overviews.count_text(listed)}; {out.lost_events(recording)}")
         out.notes(remarks)
 
 
@@ -205,18 +206,20 @@ def budget(
 
 
 def _matching(recordings: list[Path]) -> list[Path]:
-    """Folders, and those that a pattern in quotes means, which the shell left to us."""
+    """Return the folders that are named, also by patterns in quotes, which the shell left to us."""
     from glob import glob, has_magic
 
-    found: list[Path] = []
-    for one in recordings:
-        if one.exists() or not has_magic(str(one)):
-            found.append(one)
-        elif own := glob(str(one), recursive=True):  # noqa: PTH207 - as a shell: hidden ones aside
-            found += map(Path, sorted(own))
-        else:
-            raise InputError(f"{one}: no folder has such a name; see that the pattern is right")
-    return found
+    folders: list[Path] = []
+    for recording in recordings:
+        if recording.exists() or not has_magic(str(recording)):
+            folders.append(recording)
+            continue
+        matches = glob(str(recording), recursive=True)  # noqa: PTH207 - no hidden ones, as a shell
+        if not matches:
+            reason = "no folder has such a name; see that the pattern is right"
+            raise InputError(f"{recording}: {reason}")
+        folders += map(Path, sorted(matches))
+    return folders
 
 
 def check(
@@ -243,88 +246,111 @@ def check(
     if budget is None and not baseline:
         raise InputError("say what to check against: --budget FILE, or --baseline REC")
     limits = budgets.Budget() if budget is None else budgets.load_budget(budget)
-    for wanted in filter(None, (junit, markdown)):
-        new_file(wanted)
-    found: list[list[Judged]] = []
+    for file in filter(None, (junit, markdown)):
+        new_file(file)
+    judged_of: list[list[Judged]] = []  # for each recording
     compared: list[Compared] = []
     paths, before = _matching(recordings), _matching(baseline or [])
     with out.late_progress("check") as report:
         if budget is not None:
-            found = budgets.check_budgets(paths, limits, report, scheduler)
-        judged = [one for own in found for one in own]
-        unread = {one.recording for one in judged if one.what == budgets.EVENTS}
+            judged_of = budgets.check_budgets(paths, limits, report, scheduler)
+        judged = [limit for of_recording in judged_of for limit in of_recording]
+        unread = {limit.recording for limit in judged if limit.what == budgets.EVENTS}
         paths = [path for path in paths if str(path) not in unread]
         if before and paths:
             from chainshaper.verify.slowdowns import slowdowns_in
 
-            chains = chain or [one.chain for one in limits.chains]
+            chains = chain or [of_chain.chain for of_chain in limits.chains]
             compared, notes = slowdowns_in(paths, before, chains, report, scheduler)
             out.notes(notes)
     every: list[Judged | Compared] = [*judged, *compared]
     if junit is not None:
         write_whole(junit, [budgets.junit_report(every).encode()])
     if markdown is not None:
-        words = ("callbacks", "slower than before", "no slower than before")
-        parts = [budgets.markdown_report(judged)] if judged else []
-        parts += [budgets.markdown_report(compared, words)] if compared else []
-        write_whole(markdown, ["\n".join(parts).encode()])
+        write_whole(markdown, [_markdown(judged, compared).encode()])
     if json:
-        said = ("where", "what", "met", "text")
-        rows = [asdict(one) | {name: getattr(one, name) for name in said} for one in every]
+        rows = [
+            asdict(checked)
+            | {name: getattr(checked, name) for name in ("where", "what", "met", "text")}
+            for checked in every
+        ]
         out.print_json({"format": JSON_FORMAT, "limits": rows})
     else:
-        _show_checked(found, compared, budget)
-    broken = f"limits of {budget} are broken"
-    verdicts = [
-        f"{wrong} of {len(checked)} {said}"
-        for checked, said in ((judged, broken), (compared, "callbacks are slower than before"))
-        if (wrong := sum(not one.met for one in checked))
-    ]
+        _show_checked(judged_of, compared, budget)
+    verdicts = []
+    if broken := sum(not limit.met for limit in judged):
+        verdicts.append(f"{broken} of {len(judged)} limits of {budget} are broken")
+    if slower := sum(not callback.met for callback in compared):
+        verdicts.append(f"{slower} of {len(compared)} callbacks are slower than before")
     if verdicts:
         raise OperationError("; ".join(verdicts))
 
 
+def _markdown(judged: "Sequence[Judged]", compared: "Sequence[Compared]") -> str:
+    """Return a report of limits and of callbacks compared with before, where there are any."""
+    from chainshaper.monitor.budgets import markdown_report
+
+    parts = []
+    if judged:
+        parts.append(markdown_report(judged))
+    if compared:
+        words = ("callbacks", "slower than before", "no slower than before")
+        parts.append(markdown_report(compared, words))
+    return "\n".join(parts)
+
+
 def _show_checked(
-    found: "list[list[Judged]]", compared: "list[Compared]", budget: Path | None
+    judged_of: "list[list[Judged]]", compared: "list[Compared]", budget: Path | None
 ) -> None:
-    """The limits that are broken and the callbacks that are slower, or that none is."""
+    """Show the limits that are broken and the callbacks that are slower, or say that none is.
+
+    ``judged_of`` has the limits of each recording.
+    """
     from chainshaper.reporting.overviews import broken_table, fleet_table
 
-    judged = [one for own in found for one in own]
-    if broken := [one for one in judged if not one.met]:
-        out.show(*([fleet_table(found)] if len(found) > FEW else []), broken_table(broken))
+    judged = [limit for of_recording in judged_of for limit in of_recording]
+    broken = [limit for limit in judged if not limit.met]
+    if broken and len(judged_of) > FEW:
+        out.show(fleet_table(judged_of), broken_table(broken))
+    elif broken:
+        out.show(broken_table(broken))
     elif budget is not None:
         out.show_line(f"all {len(judged)} limits of {budget} are met")
-    slower = [one.text for one in compared if not one.met]
-    if compared:
-        said = f"none of {len(compared)} callbacks is slower than before"
-        out.show_line("\n".join(slower) or said)
+    slower = [callback.text for callback in compared if not callback.met]
+    if slower:
+        out.show_line("\n".join(slower))
+    elif compared:
+        out.show_line(f"none of {len(compared)} callbacks is slower than before")
 
 
 def comparison_tables(*comparisons: "cs.Comparison") -> "list[ResultTable]":
-    """An overview of several chains; of each, recordings beside each other, then each prediction
-    beside its measurement.
+    """Return tables of comparisons: an overview of several chains, and those of each chain.
+
+    These have recordings beside each other, then each prediction beside its measurement.
     """
     from chainshaper.reporting import latency
 
     tables = [latency.overview_table(comparisons)] if len(comparisons) > 1 else []
     for comparison in comparisons:
         tables.append(latency.comparison_table(comparison))
-        for one in comparison.measurements:
-            if one.prediction is not None:
-                tables.append(latency.prediction_table(one.prediction, one.recording.path.name))
+        for measurement in comparison.measurements:
+            if measurement.prediction is not None:
+                name = measurement.recording.path.name
+                tables.append(latency.prediction_table(measurement.prediction, name))
     return tables
 
 
 def taken_chains(comparisons: "Sequence[cs.Comparison]", chain: str | None) -> list[str]:
-    """Notes about recordings whose only chain was taken, since none was named."""
+    """Return notes about recordings whose only chain was taken, since none was named."""
     from chainshaper.verify.measure import taken_chain
 
-    measured = [
-        (one.chain, found) for one in comparisons for found in one.measurements if not found.plan
-    ]
-    notes = (taken_chain(found.recording, chain, spec) for spec, found in measured)
-    return list(dict.fromkeys(note for several in notes for note in several))
+    notes: dict[str, None] = {}
+    for comparison in comparisons:
+        for measurement in comparison.measurements:
+            if not measurement.plan:
+                taken = taken_chain(measurement.recording, chain, comparison.chain)
+                notes |= dict.fromkeys(taken)
+    return list(notes)
 
 
 def judge(comparisons: "Sequence[cs.Comparison]", *, strict: bool, json: bool) -> None:
@@ -442,7 +468,9 @@ def export(
         with suppress(SeveralChainsError):
             measured = cs.measure_latency(recording, chain, in_force)
         report(0.7, "writing")
-        write = cs.export_mcap if mcap else cs.export_perfetto
-        written = write(measured or recording, output)
+        if mcap:
+            written = cs.export_mcap(measured or recording, output)
+        else:
+            written = cs.export_perfetto(measured or recording, output)
     out.show_line(written.absolute())
     out.notes((*recording.info.notes, out.lost_events(recording)))

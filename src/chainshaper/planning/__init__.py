@@ -9,7 +9,7 @@ from chainshaper.planning.chain_plan import ChainPlan as ChainPlan
 from chainshaper.planning.chain_plan import Modes as Modes
 from chainshaper.planning.chain_plan import band_predictions as band_predictions
 from chainshaper.planning.chain_plan import publish_slots as publish_slots
-from chainshaper.planning.margins import read_latencies as read_latencies
+from chainshaper.planning.latencies import read_latencies as read_latencies
 from chainshaper.planning.offsets import place_chains as place_chains
 from chainshaper.planning.overruns import plan_warnings as plan_warnings
 from chainshaper.planning.plan import Plan as Plan

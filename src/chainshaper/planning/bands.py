@@ -6,8 +6,8 @@ of slot α and φ the measured distribution, the average is eq. 5,
     Σ_α (φ(x_α) − φ(x_{α−1}))·x_α,
 
 and the last slot stays where single-band shaping has it. Where an output that comes into an open
-slot waits for the next one, φ(x_α − Δ) stands for φ(x_α), as if all latencies were Δ longer. The
-optimum on a grid of instants is found by dynamic programming from the last slot backwards. With c_j
+slot waits for the next one, φ(x_α − Δ) stands for φ(x_α), as if all latencies were Δ longer.
+Dynamic programming finds the optimum on a grid of instants, from the last slot backwards. With c_j
 of n latencies ≤ x_j, the least cost of the m bands behind one that ends at x_i is
 
     B_m(i) = min over j of (c_j − c_i)·x_j + B_{m−1}(j),    B_1(i) = (n − c_i)·x_ν.
@@ -18,7 +18,7 @@ lies in a window whose ends ascend with i, and so do the c_i. The kernel keeps t
 the lines, in an order of rows in which windows only grow, so that it loses no line that a later row
 needs. Each layer is linear in the number of grid points.
 
-Particle swarm and chance (section 5.1.5, tables 3 and 4) are for comparison.
+Placement by a particle swarm and at random (section 5.1.5, tables 3 and 4) is for comparison.
 """
 
 import os
@@ -26,7 +26,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,14 +34,14 @@ from numpy.typing import NDArray
 from chainshaper import _core
 from chainshaper.planning import chain_plan as plans
 from chainshaper.planning.chain_plan import ChainPlan, Prediction, Slot, publish_slots
-from chainshaper.planning.margins import check_latencies
+from chainshaper.planning.latencies import check_latencies
 from chainshaper.robot.gate import IntoOpenSlot
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, extra_library
 from chainshaper.values.plan_choices import Goal, Solver
 
-UNREACHABLE = _core.UNREACHABLE  # the cost of what cannot be placed
-MOST_CELLS = 120_000_000  # grid points × bands: more than a gigabyte
+UNREACHABLE = _core.UNREACHABLE  # the cost of a placement that is not allowed
+MOST_CELLS = 120_000_000  # grid points × bands: more would take more than a gigabyte
 MOST_BANDS = 12  # as far as `auto` looks; figure 7 is flat from the fourth on
 RANDOM_TRIES = 10_000
 # Section 5.1.5:
@@ -51,8 +51,9 @@ PARTICLES, ITERATIONS, OPTIONS = 100, 150, {"c1": 0.5, "c2": 0.3, "w": 0.9}
 def counts_and_mean(
     ordered_ns: NDArray[np.int64], ends_ns: NDArray[np.int64] | Sequence[int]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """How many of ascending latencies publish in each slot, and the average of eq. 5. Ends ascend
-    along the last axis; the last is not before the longest latency.
+    """Count how many of ascending latencies publish in each slot; return the average of eq. 5, too.
+
+    Slot ends ascend along the last axis; the last is not before the longest latency.
     """
     ends = np.asarray(ends_ns)
     counts = np.diff(np.searchsorted(ordered_ns, ends, side="right"), prepend=0, axis=-1)
@@ -65,10 +66,10 @@ def predict_bands(
     publish_slot_ns: int,
     into_open_slot: IntoOpenSlot = "at-once",
 ) -> Prediction:
-    """What publication in slots with these ends, Δ long, makes of measured latencies.
+    """Predict what publication in slots with these ends, Δ long, makes of measured latencies.
 
     The latest output is at x_ν, the earliest at x_1 − Δ: a jitter of 25 ms for the paper's slots
-    [62, 63], [77, 78], [86, 87] ms. Where none leaves but when a slot begins, it is x_ν − x_1.
+    [62, 63], [77, 78], [86, 87] ms. Where outputs leave only when a slot begins, it is x_ν − x_1.
     """
     ends = [int(end) for end in slot_ends_ns]
     if not ends or any(after <= before for before, after in pairwise(ends)):
@@ -92,20 +93,18 @@ def _refuse_before_longest(latest_ns: int, longest_ns: int) -> None:
 
 @dataclass(frozen=True)
 class BandProblem:
-    """What a placement must respect, checked; ``latencies_ns`` ascend afterwards.
+    """The constraints of a placement, checked.
 
-    Slots are ``publish_slot_ns`` long (Δ), the last ends at ``last_end_ns``, the others at
-    multiples of ``grid_ns``. Neighbouring slot ends are at most ``max_gap_ns`` apart (LV), a band
-    has at most ``max_share`` of the executions.
+    Raises InputError: no placement could obey them.
     """
 
-    latencies_ns: NDArray[np.int64]
-    last_end_ns: int
-    publish_slot_ns: int = 1_000_000
-    grid_ns: int = 1_000
-    max_gap_ns: int | None = None
-    max_share: float | None = None
-    into_open_slot: IntoOpenSlot = "at-once"
+    latencies_ns: NDArray[np.int64]  # the sample; ascending, once the problem is made
+    last_end_ns: int  # where the last slot ends
+    publish_slot_ns: int = 1_000_000  # how long slots are (Δ)
+    grid_ns: int = 1_000  # all slots but the last end at multiples of it
+    max_gap_ns: int | None = None  # how far neighbouring slot ends may be apart (LV); None: any
+    max_share: float | None = None  # the share of the executions that a band may have; None: any
+    into_open_slot: IntoOpenSlot = "at-once"  # when an output leaves that comes into an open slot
 
     def __post_init__(self) -> None:
         slot, gap, share = self.publish_slot_ns, self.max_gap_ns, self.max_share
@@ -125,7 +124,7 @@ class BandProblem:
 
     @property
     def at_start_ns(self) -> int:
-        """How long before a slot's end what leaves in it has to be ready: 0, or Δ."""
+        """How long before a slot's end an output that leaves in it has to be ready: 0, or Δ."""
         return self.publish_slot_ns if self.into_open_slot == "next-slot" else 0
 
     @property
@@ -141,30 +140,32 @@ class BandProblem:
 
     @property
     def room(self) -> int:
-        """How many publish slots fit: x_1 ≥ L̲ + Δ + 1 ns, then steps of Δ + 1 ns at least."""
+        """How many publish slots fit: the first from L̲ + Δ + 1 ns on, then each Δ + 1 ns later."""
         behind = self.last_end_ns - int(self.latencies_ns[0])
         return max(1, behind // (self.publish_slot_ns + 1))
 
     @property
     def positions(self) -> tuple[int, int]:
-        """The first multiple of the grid above L̲ + Δ (x_1 − Δ > L̲), how many below x_ν − Δ."""
+        """Where other slots may end: the first place on the grid with x_1 − Δ > L̲, and how many
+        places there are from it on below x_ν − Δ.
+        """
         first = (int(self.latencies_ns[0]) + self.publish_slot_ns) // self.grid_ns + 1
         return first, -(-(self.last_end_ns - self.publish_slot_ns) // self.grid_ns) - first
 
 
 class Placement(NamedTuple):
-    """Slot ends, ascending, and the average that eq. 5 predicts for them."""
+    """Where the slots of latency bands are."""
 
-    slot_ends_ns: tuple[int, ...]
-    mean_ns: float
+    slot_ends_ns: tuple[int, ...]  # ascending
+    mean_ns: float  # the average latency that eq. 5 predicts
 
 
 class BandChoice(NamedTuple):
-    """A curve of figure 7, the placement that ``auto`` takes from it, and why it stops there."""
+    """What ``auto`` takes from the placements with one, two, … bands (figure 7)."""
 
     curve: tuple[Placement, ...]
     chosen: Placement
-    reason: str
+    reason: str  # why it takes no more bands
 
 
 def with_bands(
@@ -178,28 +179,32 @@ def with_bands(
     mean_at_most_ns: int | None = None,
     least_gain: float = 0.02,
     seed: int | None = None,
-    **limits: Any,
+    grid_ns: int = 1_000,
+    max_gap_ns: int | None = None,
+    max_share: float | None = None,
 ) -> ChainPlan:
-    """A shaped plan with ``bands`` publish slots of the plan's length (Δ); the last one stays.
+    """Return a shaped plan with ``bands`` publish slots of the plan's length; the last one stays.
 
-    ``most_ns`` are the latencies where others delay all executions, behind which the average is
-    not. For ``auto`` see :func:`choose_bands`, for ``minimise`` and ``mean_at_most_ns``
-    :func:`place_bands`; ``limits`` are those of :class:`BandProblem`.
+    ``most_ns`` are the latencies where others delay all executions: the average is not beyond
+    theirs. For ``auto`` see :func:`choose_bands`, for ``minimise`` and ``mean_at_most_ns``
+    :func:`place_bands`, for ``grid_ns`` to ``max_share`` :class:`BandProblem`.
 
-    Raises OperationError: no such placement exists; the message names the binding constraint.
+    Raises OperationError: no such placement exists; the message names the constraint.
     """
-    problem = _problem(plan, latencies_ns, limits)
-    other_goal = minimise != "mean" or mean_at_most_ns is not None
-    if other_goal and (bands == "auto" or solver != "exact"):
+    problem = _problem(plan, latencies_ns, grid_ns, max_gap_ns, max_share)
+    has_other_goal = minimise != "mean" or mean_at_most_ns is not None
+    if has_other_goal and (bands == "auto" or solver != "exact"):
         raise InputError("another goal than the average needs the exact solver and fixed bands")
     if bands == "auto":
         if solver != "exact":
             raise InputError("only the exact solver chooses the number of bands by itself")
-        placement = choose_bands(plan, latencies_ns, least_gain=least_gain, **limits).chosen
+        placement = _choose(problem, least_gain).chosen
     elif solver == "exact":
         placement = place_bands(problem, bands, minimise=minimise, mean_at_most_ns=mean_at_most_ns)
+    elif solver == "pso":
+        placement = place_by_swarm(problem, bands, seed)
     else:
-        placement = (place_by_swarm if solver == "pso" else place_randomly)(problem, bands, seed)
+        placement = place_randomly(problem, bands, seed)
     length, ends = problem.publish_slot_ns, placement.slot_ends_ns
     most = latencies_ns if most_ns is None else most_ns
     latest = predict_bands(most, ends, length, plan.into_open_slot)
@@ -209,34 +214,51 @@ def with_bands(
 
 
 def choose_bands(
-    plan: ChainPlan, latencies_ns: NDArray[np.int64], *, least_gain: float = 0.02, **limits: Any
+    plan: ChainPlan,
+    latencies_ns: NDArray[np.int64],
+    *,
+    least_gain: float = 0.02,
+    grid_ns: int = 1_000,
+    max_gap_ns: int | None = None,
+    max_share: float | None = None,
 ) -> BandChoice:
-    """What :func:`with_bands` takes for ``auto``: the first number of bands behind which another
-    one gains less than ``least_gain`` of the average.
+    """Choose the number of bands, as :func:`with_bands` does for ``auto``.
+
+    It is the first with which another band takes less than ``least_gain`` off the average.
     """
+    return _choose(_problem(plan, latencies_ns, grid_ns, max_gap_ns, max_share), least_gain)
+
+
+def _choose(problem: BandProblem, least_gain: float) -> BandChoice:
     if not 0 < least_gain < 1:
         raise InputError(f"the least gain is a share, such as 0.02: not {least_gain}")
-    curve = placement_curve(_problem(plan, latencies_ns, limits), MOST_BANDS)
+    curve = placement_curve(problem, MOST_BANDS)
     chosen, most = curve[-1], len(curve[-1].slot_ends_ns)
-    why = "no more bands can be placed" if most < MOST_BANDS else "more bands are not tried"
-    gains = ((1 - two.mean_ns / one.mean_ns, one) for one, two in pairwise(curve))
-    if small := next((own for own in gains if own[0] < least_gain), None):
-        gain, chosen = small
-        why = f"another band would lower the average by {gain:.2%}, less than {least_gain:.2%}"
-    return BandChoice(tuple(curve), chosen, f"stopped at {len(chosen.slot_ends_ns)}: {why}")
+    reason = "no more bands can be placed" if most < MOST_BANDS else "more bands are not tried"
+    for placement, with_another in pairwise(curve):
+        gain = 1 - with_another.mean_ns / placement.mean_ns
+        if gain < least_gain:
+            chosen = placement
+            reason = f"another band would lower the average by {gain:.2%}, less than"
+            reason += f" {least_gain:.2%}"
+            break
+    return BandChoice(tuple(curve), chosen, f"stopped at {len(chosen.slot_ends_ns)}: {reason}")
 
 
 def with_long_slot(
     plan: ChainPlan, latencies_ns: NDArray[np.int64], slot_start_ns: int
 ) -> ChainPlan:
-    """A shaped plan with one long publish slot, from ``slot_start_ns`` to where it ended before:
-    the average falls and the jitter grows as it starts earlier (end of section 4.1).
+    """Return a shaped plan with one long publish slot, from ``slot_start_ns`` to where it ended.
+
+    The earlier it starts, the smaller is the average and the larger the jitter (end of section
+    4.1).
     """
     start, end = _last_publish_slot(plan)
     if not 0 <= slot_start_ns <= start:
         raise InputError(f"a long publish slot may start from 0 ms to {duration_text(start)}")
     published = np.maximum(check_latencies(latencies_ns), slot_start_ns)
-    # Published at once, the output is late by the publication itself, which the slot's end bounds.
+    # An output that leaves at once is late by its publication, which ends with the slot at the
+    # latest.
     mean_ns = round(int(published.sum()) / published.size)
     predicted = plans.in_one_slot((slot_start_ns, end), mean_ns)
     slots = ((slot_start_ns, end),)
@@ -244,11 +266,23 @@ def with_long_slot(
 
 
 def _problem(
-    plan: ChainPlan, latencies_ns: NDArray[np.int64], limits: dict[str, Any]
+    plan: ChainPlan,
+    latencies_ns: NDArray[np.int64],
+    grid_ns: int,
+    max_gap_ns: int | None,
+    max_share: float | None,
 ) -> BandProblem:
+    """Return the constraints for bands of a plan, whose last publish slot stays."""
     start, end = _last_publish_slot(plan)
-    limits = {**limits, "into_open_slot": plan.into_open_slot}
-    return BandProblem(latencies_ns, end, publish_slot_ns=end - start, **limits)
+    return BandProblem(
+        latencies_ns,
+        last_end_ns=end,
+        publish_slot_ns=end - start,
+        grid_ns=grid_ns,
+        max_gap_ns=max_gap_ns,
+        max_share=max_share,
+        into_open_slot=plan.into_open_slot,
+    )
 
 
 def _last_publish_slot(plan: ChainPlan) -> Slot:
@@ -258,20 +292,20 @@ def _last_publish_slot(plan: ChainPlan) -> Slot:
 
 
 def with_publish_slots(plan: ChainPlan, slots: Sequence[Slot], **changes: object) -> ChainPlan:
-    """The plan with other slots for its output, and other fields."""
+    """Return the plan with other slots for its output, and other fields."""
     publishing = plans.output_server(plan)
-    others = {} if publishing is None else {publishing.name: slots}
-    servers = plans.below_executors(plans.with_slots(plan.servers, others))
+    slots_of = {} if publishing is None else {publishing.name: slots}
+    servers = plans.below_executors(plans.with_slots(plan.servers, slots_of))
     return plans.revised(plan, servers=servers, **changes)
 
 
 def place_bands(
     problem: BandProblem, bands: int, *, minimise: Goal = "mean", mean_at_most_ns: int | None = None
 ) -> Placement:
-    """The best placement of ``bands`` slots that exists on the grid.
+    """Find the best placement of ``bands`` slots on the grid.
 
-    ``minimise`` the average (eq. 5; among equals the one with the smallest jitter), or, while the
-    average stays at or below ``mean_at_most_ns``, the overall jitter x_ν − (x_1 − Δ), or the
+    Minimise the average (eq. 5; of equal placements take that with the smallest jitter), or, while
+    the average stays at or below ``mean_at_most_ns``, the overall jitter x_ν − (x_1 − Δ), or the
     largest gap between neighbouring bands.
 
     Raises OperationError: no placement exists; the message names the constraint that prevents it.
@@ -296,7 +330,7 @@ def place_bands(
 
 
 def placement_curve(problem: BandProblem, most_bands: int) -> list[Placement]:
-    """The best placement for each number of bands from one on, as far as they fit (figure 7)."""
+    """Find the best placement for each number of bands from 1 on, as far as they fit (figure 7)."""
     most = min(most_bands, problem.room)
     tables = _Tables(problem, most)
     curve: list[Placement] = []
@@ -314,20 +348,19 @@ def _refuse_more_than_fit(problem: BandProblem, bands: int) -> None:
     if bands < 1:
         raise InputError(f"{bands} bands: plan with one band at least")
     if bands > problem.room:
-        where = (
-            f"behind the shortest latency {duration_text(int(problem.latencies_ns[0]))} there is"
-        )
-        reason = (
-            f"room for {problem.room} publish slots of {duration_text(problem.publish_slot_ns)}"
-        )
+        shortest, slot = problem.latencies_ns[0], problem.publish_slot_ns
+        where = f"behind the shortest latency {duration_text(int(shortest))} there is"
+        reason = f"room for {problem.room} publish slots of {duration_text(slot)}"
         raise InputError(f"{bands} bands cannot be placed: {where} {reason}: use fewer or shorter")
 
 
 class _Tables:
-    """Grid positions and, for each number of bands behind one, their cost and the next band.
+    """The tables of the dynamic programming: a column for each grid position.
 
-    Row m of ``costs`` is for m + 1 bands behind a position; ``successors`` are positions, −1 where
-    the last band follows.
+    * ``ends``: the instant (ns) of each position.
+    * ``counts``: how many latencies may publish in a slot that ends there.
+    * ``costs``: row m is the least cost of m + 1 bands behind a band that ends there.
+    * ``successors``: row m is the position of the first of these bands; −1: only the last follows.
     """
 
     def __init__(self, problem: BandProblem, bands: int) -> None:
@@ -368,13 +401,15 @@ class _Tables:
             )
 
     def totals(self, bands: int) -> NDArray[np.int64]:
-        """The cost of all bands for every position of the first; two bands at least."""
+        """Return the cost of all bands for each position of the first; of two bands at least."""
         behind = self.costs[bands - 2]
         allowed = (behind != UNREACHABLE) & (self.counts <= self.problem.most_per_band)
         return np.where(allowed, behind + self.counts * self.ends * allowed, UNREACHABLE)
 
     def best(self, bands: int) -> Placement | None:
-        """Of equally good placements the one that begins last, which has the smallest jitter."""
+        """Return the best placement; of equally good ones that which begins last: it has the
+        smallest jitter.
+        """
         if bands == 1:
             fits = self.problem.latencies_ns.size <= self.problem.most_per_band
             last = self.problem.last_end_ns
@@ -387,7 +422,7 @@ class _Tables:
         return None if least == UNREACHABLE else self.read(bands, place)
 
     def read(self, bands: int, position: int) -> Placement:
-        """The placement whose first band is at a position."""
+        """Return the placement whose first band is at a position."""
         mean = int(self.totals(bands)[position]) / self.problem.latencies_ns.size
         ends = [int(self.ends[position])]
         for behind in range(bands - 2, 0, -1):
@@ -396,34 +431,41 @@ class _Tables:
         return Placement((*ends, self.problem.last_end_ns), mean)
 
 
-def _smallest_gap(problem: BandProblem, found: Placement, mean_at_most_ns: int | None) -> Placement:
-    # A larger gap only ever allows more: the smallest one that is enough is found by halving.
+def _smallest_gap(problem: BandProblem, best: Placement, mean_at_most_ns: int | None) -> Placement:
+    """Return the placement with the smallest of its largest gaps, with as many bands as ``best``.
+
+    A larger gap only ever allows more placements: halve the interval.
+    """
     low = problem.publish_slot_ns
-    high = max(np.diff(found.slot_ends_ns), default=low + 1)
+    high = max(np.diff(best.slot_ends_ns), default=low + 1)
     while high - low > 1:
         middle = int(low + high) // 2
         closer = replace(problem, max_gap_ns=middle)
         try:
-            found = place_bands(closer, len(found.slot_ends_ns), mean_at_most_ns=mean_at_most_ns)
-            high = max(np.diff(found.slot_ends_ns))
+            best = place_bands(closer, len(best.slot_ends_ns), mean_at_most_ns=mean_at_most_ns)
+            high = max(np.diff(best.slot_ends_ns))
         except OperationError:
             low = middle
-    return found
+    return best
 
 
 def _why_none(problem: BandProblem, bands: int) -> str:
-    """Which constraint leaves no placement: the one without which there is one."""
+    """Say which constraint leaves no placement: that without which there is a placement."""
     share, gap = problem.max_share or 1, duration_text(problem.max_gap_ns or 0)
-    reasons = {
-        ("max_share",): f"no placement has every band at {share:.1%} of the executions; allow a"
-        " larger share or more bands",
-        ("max_gap_ns",): f"no placement has neighbours within {gap}; allow a larger gap",
-        ("max_share", "max_gap_ns"): "the largest gap and the largest share exclude each other;"
-        " relax one",
-    }
-    for names, reason in reasons.items():
-        changes: dict[str, Any] = dict.fromkeys(names)
-        if _Tables(replace(problem, **changes), bands).best(bands) is not None:
+    without_share, without_gap = replace(problem, max_share=None), replace(problem, max_gap_ns=None)
+    for relaxed, reason in (
+        (
+            without_share,
+            f"no placement has every band at {share:.1%} of the executions; allow a larger share or"
+            " more bands",
+        ),
+        (without_gap, f"no placement has neighbours within {gap}; allow a larger gap"),
+        (
+            replace(without_share, max_gap_ns=None),
+            "the largest gap and the largest share exclude each other; relax one",
+        ),
+    ):
+        if _Tables(relaxed, bands).best(bands) is not None:
             return f"{bands} bands cannot be placed: {reason}"
     return _too_coarse(problem, bands)
 
@@ -434,7 +476,10 @@ def _too_coarse(problem: BandProblem, bands: int) -> str:
 
 
 def broken_constraint(problem: BandProblem, slot_ends_ns: Sequence[int]) -> str | None:
-    """The first constraint that given slot ends break, in words; the grid is not among them."""
+    """Return the first constraint that given slot ends break, in words; None: they break none.
+
+    The grid is not checked.
+    """
     broken = _broken(problem, np.array(slot_ends_ns))
     return next((words for words, off in broken if off > 0), None)
 
@@ -442,7 +487,7 @@ def broken_constraint(problem: BandProblem, slot_ends_ns: Sequence[int]) -> str 
 def _broken(
     problem: BandProblem, ends: NDArray[np.int64]
 ) -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """Each constraint in words, and by how much (ns) each row of slot ends breaks it."""
+    """Yield each constraint in words, and by how much (ns) each row of slot ends breaks it."""
     slot, shortest = problem.publish_slot_ns, int(problem.latencies_ns[0])
     gaps = np.diff(ends, axis=-1)
     if ends.shape[-1] > 1:
@@ -461,9 +506,10 @@ def _broken(
 
 
 def place_by_swarm(problem: BandProblem, bands: int, seed: int | None = None) -> Placement:
-    """Place bands with PySwarms and the paper's parameters. Particles are the ends of all slots but
-    the last; one that breaks a constraint costs more, the further it is off, than any that does
-    not.
+    """Place bands with PySwarms and the paper's parameters.
+
+    A particle is the ends of all slots but the last. One that breaks a constraint costs more than
+    any that breaks none, and the more, the further it is off.
     """
     _refuse_more_than_fit(problem, bands)
     last, slot, grid = problem.last_end_ns, problem.publish_slot_ns, problem.grid_ns
@@ -477,7 +523,7 @@ def place_by_swarm(problem: BandProblem, bands: int, seed: int | None = None) ->
     def cost(particles: NDArray[np.float64]) -> NDArray[np.float64]:
         ends = slot_ends(particles)
         _, means = counts_and_mean(problem.ready_ns, ends)
-        off = sum(off for _, off in _broken(problem, ends))
+        off = sum(off_ns for _, off_ns in _broken(problem, ends))
         return np.where(off > 0, last + off, means)
 
     lowest = np.full(bands - 1, float(problem.latencies_ns[0] + slot))
@@ -491,8 +537,9 @@ def place_by_swarm(problem: BandProblem, bands: int, seed: int | None = None) ->
 
 
 def place_randomly(problem: BandProblem, bands: int, seed: int | None = None) -> Placement:
-    """Place bands at random, every allowed placement on the grid being equally likely. Raises
-    OperationError: the grid is too coarse, or no draw of many respects the limits.
+    """Place bands at random; every allowed placement on the grid is equally likely.
+
+    Raises OperationError: the grid is too coarse, or no draw of many obeys the constraints.
     """
     _refuse_more_than_fit(problem, bands)
     if bands == 1:
@@ -513,23 +560,27 @@ def place_randomly(problem: BandProblem, bands: int, seed: int | None = None) ->
     return _checked(problem, placed, "the last random draw")
 
 
-def _checked(problem: BandProblem, ends: list[int], what: str) -> Placement:
+def _checked(problem: BandProblem, ends: list[int], solver: str) -> Placement:
+    """Return the placement at which a ``solver``, so called in the error, ended."""
     if broken := broken_constraint(problem, ends):
-        reason = f"{what} ended at a placement that is not allowed ({broken})"
+        reason = f"{solver} ended at a placement that is not allowed ({broken})"
         raise OperationError(f"{reason}; use the exact solver")
     return Placement(tuple(ends), float(counts_and_mean(problem.ready_ns, ends)[1]))
 
 
 @contextmanager
 def _quiet_and_seeded(seed: int | None) -> Iterator[None]:
-    """PySwarms draws from NumPy's global generator, whose state comes back, and logs into the
+    """Seed PySwarms, and keep it from logging.
+
+    It draws from NumPy's global generator, whose state is restored afterwards, and logs into the
     current folder, unless a configuration says otherwise.
     """
     state, configured = np.random.get_state(), os.environ.get("LOG_CFG")
     with os.fdopen(os.memfd_create("logging"), "w", encoding="utf-8") as configuration:
         configuration.write("version: 1\nincremental: true\n")
         configuration.flush()
-        os.environ["LOG_CFG"] = f"/proc/self/fd/{configuration.fileno()}"  # gone with us
+        # A file in memory: the kernel removes it with this process, however that ends.
+        os.environ["LOG_CFG"] = f"/proc/self/fd/{configuration.fileno()}"
         try:
             np.random.seed(seed)
             yield

@@ -5,10 +5,13 @@ integer nanoseconds, in fields that end in ``_ns``; in YAML the same keys stand 
 their values with a unit (``period: 100ms``). Slots are half-open and count from a cycle's start.
 
 A server may stop the thread of an asynchronous publisher (design 1, section 3.2.1), which shares
-locks with its process. With Fast DDS 2.14, three things are destructive and refused: a slot hardly
-longer than a send (0.25 ms; stopped in one, the thread has what every publisher needs); a thread
-that out-ranks its executor on the same core (it spins for the lock under which that hands a message
-over); and a history too shallow for what comes while it may not run.
+locks with its process. With Fast DDS 2.14, three things are destructive and refused:
+
+* a slot hardly longer than a send (0.25 ms): a thread that is stopped in a send keeps the locks
+  that every publisher of its process needs;
+* a thread that out-ranks its executor on the same core: it spins for the lock under which the
+  executor hands a message over;
+* a history too shallow for the messages that come while the thread may not run.
 """
 
 import re
@@ -44,11 +47,13 @@ PER_CALLBACK = ("server-per-callback", "let-per-callback", "pipelined")
 UNSHAPED = ("server-per-chain", "server-per-callback")
 
 
-def _plain_name(what: str) -> AfterValidator:
+def _plain_name(kind: str) -> AfterValidator:
+    """Check the name of a mode or a node, as ``kind`` says."""
+
     def check(value: str) -> str:
         if re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", value):
             return value
-        raise ValueError(f"{value!r} is not a {what}'s name: write letters, digits and underscores")
+        raise ValueError(f"{value!r} is not a {kind}'s name: write letters, digits and underscores")
 
     return AfterValidator(check)
 
@@ -60,35 +65,36 @@ Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Slot: TypeAlias = tuple[Duration, Duration]
 """A time slot [start, end) of a cycle."""
 Wrong: TypeAlias = Iterator[tuple[str | int, ...]]
-"""What a rule finds: the reason, and where it is wrong, by keys as in the file."""
+"""What breaks a rule: for each place the reason, and behind it the place's keys in the file."""
 
 
 def checked(model: Model, *rules: Callable[[Model], Wrong]) -> Model:
-    """A model that obeys these rules: the first that does not hold is raised."""
+    """Return a model that obeys these rules. Raises an error for the first that it breaks."""
     for reason, *where in chain.from_iterable(rule(model) for rule in rules):
         raise wrong_value(str(reason), *where)
     return model
 
 
 def slot_text(slot: Slot) -> str:
-    """A slot as people write it: ``[86ms, 87ms)``."""
+    """Return a slot as people write it: ``[86ms, 87ms)``."""
     return f"[{duration_text(slot[0])}, {duration_text(slot[1])})"
 
 
-def meet(one: Slot, two: Slot) -> bool:
+def meet(first: Slot, second: Slot) -> bool:
     """Whether two slots overlap."""
-    return one[0] < two[1] and two[0] < one[1]
+    return first[0] < second[1] and second[0] < first[1]
 
 
 class ChainOfPlan(Part):
-    """The chain that is planned for. From bare latencies only the period is known: such a plan can
-    be studied, not carried out. ``publisher`` is a node, ``output_depth`` its writer's history.
+    """The chain that is planned for.
+
+    From bare latencies only the period is known. Such a plan can be studied, not carried out.
     """
 
-    spec: str | None = None
-    output: FullName | None = None
-    publisher: FullName | None = None
-    output_depth: FromOne | None = None
+    spec: str | None = None  # the chain as the user wrote it: /t1../t5
+    output: FullName | None = None  # its last topic
+    publisher: FullName | None = None  # the node that publishes the output
+    output_depth: FromOne | None = None  # history depth of the output's writer
     period_ns: PositiveDuration
 
 
@@ -137,22 +143,26 @@ class Evidence(Part):
 class Margin(Part):
     """How far the chain's slot reaches beyond the longest undisturbed latency (ε of eq. 1).
 
-    ``given``; ``measured``: it covers all cycles but a share, for which ``stalls_ns`` of it are
-    needed; ``derived``: it is the upper end of an interval that the tail of the latencies has.
-    ``overrun_probability`` is the share of late outputs, at most, with 95 % confidence;
-    ``independent_cycles`` is how many the sample is worth, where long cycles come in clusters.
+    See :mod:`chainshaper.planning.margins`.
     """
 
     epsilon_ns: Duration
+    # By the user; measured: it covers all cycles of the sample but a share; derived: it is the
+    # upper end of an interval for the tail of the latencies.
     source: Literal["given", "measured", "derived"] = "given"
+    # The share of late outputs, at most, with 95 % confidence.
     overrun_probability: Annotated[float, Field(gt=0, le=1)] | None = None
-    stalls_ns: Duration = 0
-    confidence_interval_ns: tuple[Duration, Duration] | None = None
+    stalls_ns: Duration = 0  # the part of it that covers disturbed cycles
+    confidence_interval_ns: tuple[Duration, Duration] | None = None  # of a derived margin
+    # How many cycles the sample is worth, where long cycles come in clusters.
     independent_cycles: FromOne | None = None
 
 
 def _callback(value: str) -> str:
-    """A callback by what starts it, in one spelling. Raises ValueError: it is neither."""
+    """Return what starts a callback in its one spelling: a topic, or a timer's `every 100ms`.
+
+    Raises ValueError: it is neither.
+    """
     if value.startswith("every "):
         return f"every {format_duration(parse_duration(value.removeprefix('every ')))}"
     if re.fullmatch(r"(/[A-Za-z_]\w*)+", value):
@@ -163,91 +173,83 @@ def _callback(value: str) -> str:
 class Thread(Part):
     """A thread of a node that runs inside a server; other DDS threads are never gated (sec. 3.1).
 
-    A node may have callback groups with an executor each (section 6): ``callbacks`` are those of
-    the one that is meant, by topic or as ``every 100ms``. Without, all executors of the node are.
+    A node may have callback groups with an executor each (section 6).
     """
 
     node: FullName
     role: Literal["executor", "publisher"] = "executor"
+    # The callbacks of the executor, by topic or as `every 100ms`; none: all executors of the node.
     callbacks: tuple[Annotated[str, AfterValidator(_callback)], ...] = ()
 
-    def overlaps(self, other: "Thread") -> bool:
-        """Whether a thread may be both."""
-        apart = self.callbacks and other.callbacks
-        same = (self.node, self.role) == (other.node, other.role)
-        return same and not (apart and set(self.callbacks).isdisjoint(other.callbacks))
+    def overlaps(self, thread: "Thread") -> bool:
+        """Whether a running thread may be both."""
+        if (self.node, self.role) != (thread.node, thread.role):
+            return False
+        if not self.callbacks or not thread.callbacks:
+            return True
+        return not set(self.callbacks).isdisjoint(thread.callbacks)
 
     @property
     def text(self) -> str:
-        """A thread as messages name it."""
-        said = f" that runs {', '.join(self.callbacks)}" if self.callbacks else ""
-        return f"the {self.role} of {self.node}{said}"
+        """The thread as messages name it."""
+        runs = f" that runs {', '.join(self.callbacks)}" if self.callbacks else ""
+        return f"the {self.role} of {self.node}{runs}"
 
 
 class Server(Part):
-    """A table-driven reservation server (section 2.2.1): its threads run in its slots only, the
-    first the most urgent (:attr:`.Plan.most_urgent_first`). A smaller ``priority`` is
-    better, as in LITMUS^RT. One for ``best_effort`` (R_m' and R_int of the paper, sections 3.1 and
-    5.1) runs only what is left of its core by all others.
-    """
+    """A table-driven reservation server (section 2.2.1): its threads run in its slots only."""
 
     name: Annotated[str, Field(min_length=1)]
     core: Count
-    priority: FromOne
+    priority: FromOne  # a smaller one is better, as in LITMUS^RT
     slots: Annotated[tuple[Slot, ...], Field(min_length=1)]
-    threads: tuple[Thread, ...] = ()
+    threads: tuple[Thread, ...] = ()  # the most urgent first (:attr:`.Plan.most_urgent_first`)
+    # Whether its threads have only the time that all others leave of its core (R_m' and R_int of
+    # the paper, sections 3.1 and 5.1).
     best_effort: bool = False
 
     @model_validator(mode="after")
     def _slots_ascend(self) -> "Server":
         for number, (before, slot) in enumerate(pairwise(((0, 0), *self.slots))):
-            what = f"the slot {slot_text(slot)}"
+            named = f"the slot {slot_text(slot)}"
             if slot[0] >= slot[1]:
-                reason = f"{what} is empty: its end must come after its start"
+                reason = f"{named} is empty: its end must come after its start"
                 raise wrong_value(reason, "slots", number)
             if slot[0] < before[1]:
-                reason = f"{what} begins before {slot_text(before)} ends: write slots ascending"
+                reason = f"{named} begins before {slot_text(before)} ends: write slots ascending"
                 raise wrong_value(f"{reason}, no overlap", "slots", number)
         return self
 
 
 class ReceiverPlace(Part):
-    """Where the executors of those run that receive a shaped output.
+    """Where the executors of the nodes run that receive a shaped output.
 
-    At the ``priority`` of outputs, as servers count it, they run behind shaping nodes and above all
-    servers of chains. For ``time_ns`` in a cycle, at most, the plan leaves the core to them.
+    They run behind shaping nodes and above all servers of chains.
     """
 
     core: Count
-    priority: FromOne
-    time_ns: Duration
+    priority: FromOne  # that of outputs, as servers count priorities
+    time_ns: Duration  # for so long in a cycle, at most, the plan leaves the core to them
 
 
 class ShapingNode(Part):
-    """The node that takes the chain's output from ``input`` and republishes it on ``output``, in
-    the slots of the server that has its thread.
-
-    It spins from ``spin_ns`` before the slot on, and pauses for ``pause_ns`` after a publication so
-    that it does not delay delivery. ``publisher`` is the node whose output it takes, where that is
-    not `chain.publisher`. The executors of ``receivers``, which subscribe to the output, run under
-    SCHED_FIFO, at ``receivers_at`` or, without, below all servers. ``depth`` messages may wait in
-    it (None: see :class:`.Wishes`). With ``in_process`` it is a thread in the publisher's process,
-    where a library takes what is published, which tracers call ``input``. With ``delivery_ns`` a
-    library in the receivers' processes hands them each message that long behind its publication.
-    """
+    """The node that takes a topic and republishes it in the slots of the server with its thread."""
 
     name: Annotated[str, _plain_name("node")]
-    input: FullName
-    output: FullName
-    publisher: FullName | None = None
+    input: FullName  # the topic on which the chain publishes
+    output: FullName  # the topic that its subscribers have
+    publisher: FullName | None = None  # the node that publishes `input`, if not `chain.publisher`
     core: Count
     fifo_priority: Annotated[int, Field(ge=1, le=98)]
-    spin_ns: Duration
-    pause_ns: Duration
-    receivers: tuple[FullName, ...] = ()
-    receivers_at: ReceiverPlace | None = None
-    depth: FromOne | None = None
+    spin_ns: Duration  # so long before the slot it begins to watch the clock
+    pause_ns: Duration  # so long it rests after a publication, so that it does not delay delivery
+    receivers: tuple[FullName, ...] = ()  # nodes that subscribe to `output`, under SCHED_FIFO
+    receivers_at: ReceiverPlace | None = None  # where they run; None: below all servers
+    depth: FromOne | None = None  # how many messages may wait in it; None: see :class:`.Wishes`
+    # Whether it is a thread in the publisher's process, where a library takes what is published;
+    # tracers call that `input`.
     in_process: bool = False
+    # So long behind its publication a library in the receivers' processes hands each message over.
     delivery_ns: PositiveDuration | None = None
 
     @property
@@ -268,16 +270,13 @@ class ShapingNode(Part):
 
 
 class Modes(Part):
-    """Which latency band, 1 for the first slot, the output has in each mode (sections 3.3, 6).
+    """Which latency band the output has in each mode of the system (sections 3.3 and 6)."""
 
-    The active mode is read from ``topic``, a ``std_msgs/msg/String``; until then it is ``default``.
-    A ``late`` output waits for its mode's slot of the next cycle, is discarded, leaves at once
-    (``publish``), or takes the ``next-slot`` of the cycle.
-    """
-
-    topic: FullName
-    default: ModeName
-    bands: Annotated[dict[ModeName, FromOne], Field(min_length=1)]
+    topic: FullName  # a `std_msgs/msg/String` that names the mode in force
+    default: ModeName  # the mode in force until the topic names another
+    bands: Annotated[dict[ModeName, FromOne], Field(min_length=1)]  # 1 is the first slot
+    # An output behind its mode's slot: it waits for that of the next cycle, is discarded, leaves at
+    # once (`publish`), or takes the `next-slot` of the cycle.
     late: Late = "wait"
 
     @model_validator(mode="after")
@@ -289,71 +288,66 @@ class Modes(Part):
 
 
 class Adaptation(Part):
-    """How slots follow the latencies of what runs (:class:`~chainshaper.planning.margins.Tail`).
+    """How slots follow the latencies of what runs (:class:`~chainshaper.planning.adaptation.Tail`).
 
-    They move later when ``late`` times the promised share of the last ``window`` cycles would have
-    been late in them; earlier where that has taken at least the share ``gain`` off the latency for
-    ``after`` cycles on end. None ends behind ``max_latency_ns`` (None: behind the cycle).
+    Slots move later when too many cycles would have been late in them, and earlier when that takes
+    enough off the latency.
     """
 
-    window: Annotated[int, Field(ge=500, le=1_000_000)] = 4_000
-    late: Annotated[float, Field(gt=1, le=10)] = 1.5
-    gain: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    after: FromOne = 500
-    max_latency_ns: PositiveDuration | None = None
+    window: Annotated[int, Field(ge=500, le=1_000_000)] = 4_000  # so many last cycles are judged
+    late: Annotated[float, Field(gt=1, le=10)] = 1.5  # so many times the promised share is too many
+    gain: Annotated[float, Field(gt=0, lt=1)] = 0.01  # the least share of the latency to be gained
+    after: FromOne = 500  # for so many cycles on end that has to be gained
+    max_latency_ns: PositiveDuration | None = None  # where slots end at the latest; None: the cycle
 
 
 class Prediction(Part):
     """What the plan promises: end-to-end latency, and the share of cycles per latency band.
 
-    A band is represented by the end of its slot (section 4.1). The jitter is the widest distance of
-    two outputs, from the start of the first slot to the end of the last. ``modes`` has each mode's,
-    ``receivers`` the same until the receiver's callback starts (None: nothing is promised).
+    A band is represented by the end of its slot (section 4.1).
     """
 
     mean_ns: Duration
     max_ns: Duration
-    jitter_ns: Duration
-    shares: tuple[Share, ...] = ()
-    modes: "dict[ModeName, Prediction] | None" = None
+    jitter_ns: Duration  # from the start of the first slot to the end of the last
+    shares: tuple[Share, ...] = ()  # of each band
+    modes: "dict[ModeName, Prediction] | None" = None  # the same in each mode
+    # The same until the callbacks of receivers start; None: nothing is promised.
     receivers: "Prediction | None" = None
 
 
 class BandPrediction(NamedTuple):
-    """One latency band: its slot, its share of the cycles, its jitter at most."""
+    """What a plan promises of a latency band."""
 
-    start_ns: int
+    start_ns: int  # of its slot
     end_ns: int
-    share: float
-    jitter_ns: int
+    share: float  # of the cycles
+    jitter_ns: int  # at most
 
 
 class ChainPlan(Part):
-    """Servers and shaping nodes for one chain, with the evidence and the prediction.
-
-    ``cycle_ns`` is a whole multiple of the chain's period; cycles start ``offset_ns`` after the
-    instant from which those of all chains count. For ``anchor`` to ``messages`` see
-    :mod:`chainshaper.robot.gate`, for the next four :mod:`chainshaper.values.plan_choices`.
-    ``shaping_node`` serves the chain's output, unless the publisher's own thread is gated;
-    ``further_shaping_nodes`` serve other sinks, or topics inside a chain (LET per callback).
-    """
+    """Servers and shaping nodes for one chain, with the evidence and the prediction."""
 
     chain: ChainOfPlan
     evidence: Evidence
     margin: Margin
     policy: Policy
-    cycle_ns: PositiveDuration
-    offset_ns: Duration = 0
+    cycle_ns: PositiveDuration  # a whole multiple of the chain's period
+    offset_ns: Duration = 0  # of its cycles, from the instant that cycles of all chains count from
+    # See :mod:`chainshaper.robot.gate`:
     anchor: Anchor = "stamp"
     overrun: Overrun = "wait"
     into_open_slot: IntoOpenSlot = "at-once"
     messages: Messages = "all-in-order"
+    # See :mod:`chainshaper.values.plan_choices`:
     fallback: Fallback = "bypass"
     shaping_thread: ShapingThread = "free"
     equal_priorities: EqualPriorities = "apart"
     slot_ends: SlotEnds = "open-until-done"
     servers: Annotated[tuple[Server, ...], Field(min_length=1)]
+    # That of the chain's output; None: nothing is shaped, or the publisher's own thread is gated.
     shaping_node: ShapingNode | None = None
+    # Those of further sinks, or of topics inside the chain (LET per callback).
     further_shaping_nodes: tuple[ShapingNode, ...] = ()
     modes: Modes | None = None
     adaptation: Adaptation | None = None
@@ -366,32 +360,36 @@ class ChainPlan(Part):
 
 
 def in_one_slot(slot: Slot, mean_ns: int | None = None) -> Prediction:
-    """What is promised of outputs that all leave in one slot, by default (eq. 5) at its end."""
+    """Return the prediction for outputs that leave in one slot, by default (eq. 5) at its end."""
     start, end = slot
     mean_ns = end if mean_ns is None else mean_ns
     return Prediction(mean_ns=mean_ns, max_ns=end, jitter_ns=end - start, shares=(1.0,))
 
 
 def server_of(plan: ChainPlan, thread: Thread) -> Server | None:
-    """The server that a thread is assigned to, or None when it runs outside all servers."""
+    """Return the server that a thread is assigned to; None: it runs outside all servers."""
     return next((server for server in plan.servers if thread in server.threads), None)
 
 
 def shaping_nodes(plan: ChainPlan) -> list[ShapingNode]:
-    """All shaping nodes of a plan, that of the chain's output first."""
-    return [*([plan.shaping_node] if plan.shaping_node else []), *plan.further_shaping_nodes]
+    """Return all shaping nodes of a plan, that of the chain's output first."""
+    if plan.shaping_node is None:
+        return [*plan.further_shaping_nodes]
+    return [plan.shaping_node, *plan.further_shaping_nodes]
 
 
 def inner_gates(plan: ChainPlan) -> tuple[ShapingNode, ...]:
-    """The shaping nodes of topics inside the chain, whose messages have only to be there when the
-    next callback is to start: under LET per callback all but that of the output.
+    """Return the shaping nodes of topics inside the chain: under LET per callback.
+
+    Their messages have only to be there when the next callback is to start.
     """
     return plan.further_shaping_nodes if plan.policy == "let-per-callback" else ()
 
 
 def output_server(plan: ChainPlan) -> Server | None:
-    """The server in whose slots the chain's output is published; None without shaping. A plan from
-    bare latencies names no threads: its server ``output`` is meant.
+    """Return the server in whose slots the chain's output is published; None: nothing is shaped.
+
+    A plan from bare latencies names no threads; there it is the server called ``output``.
     """
     server = None
     if plan.shaping_node is not None:
@@ -404,32 +402,40 @@ def output_server(plan: ChainPlan) -> Server | None:
 
 
 def publish_slots(plan: ChainPlan) -> tuple[Slot, ...]:
-    """The slots of :func:`output_server`, ascending; none without shaping."""
-    return server.slots if (server := output_server(plan)) else ()
+    """Return the slots of :func:`output_server`, ascending; none where nothing is shaped."""
+    server = output_server(plan)
+    return () if server is None else server.slots
 
 
 def band_predictions(plan: ChainPlan) -> tuple[BandPrediction, ...]:
-    """The prediction band by band; none where nothing is shaped, or slots were edited in number."""
+    """Return the prediction of each band; of none where nothing is shaped.
+
+    There is none either where a user has added or removed a slot in the plan's file.
+    """
     slots, shares = publish_slots(plan), plan.predicted.shares
     if len(slots) != len(shares):
         return ()
-    exact, bands = plan.into_open_slot == "next-slot", zip(slots, shares, strict=True)
-    return tuple(BandPrediction(a, b, own, 0 if exact else b - a) for (a, b), own in bands)
+    is_exact = plan.into_open_slot == "next-slot"  # outputs leave only when a slot begins
+    return tuple(
+        BandPrediction(start, end, share, jitter_ns=0 if is_exact else end - start)
+        for (start, end), share in zip(slots, shares, strict=True)
+    )
 
 
 def publishing_servers(plan: ChainPlan) -> tuple[Server, ...]:
-    """All servers in whose slots something is published: the output, other sinks, inner topics."""
-    nodes = {node.thread for node in shaping_nodes(plan)}
+    """Return all servers in whose slots something is published: outputs, or topics inside."""
+    gates = {node.thread for node in shaping_nodes(plan)}
     output = output_server(plan)
     return tuple(
         server
         for server in plan.servers
-        if server is output or any(t in nodes or t.role == "publisher" for t in server.threads)
+        if server is output
+        or any(thread in gates or thread.role == "publisher" for thread in server.threads)
     )
 
 
 def running_servers(plan: ChainPlan) -> list[Server]:
-    """The servers that run the chain: in which nothing is published, and none for best effort."""
+    """Return the servers that run the chain: nothing is published in them, none is best effort."""
     publishing = publishing_servers(plan)
     return [
         server for server in plan.servers if server not in publishing and not server.best_effort
@@ -439,7 +445,7 @@ def running_servers(plan: ChainPlan) -> list[Server]:
 def with_slots(
     servers: Iterable[Server], slots: Mapping[str, Sequence[Slot]]
 ) -> tuple[Server, ...]:
-    """The servers, of which those of these names have other slots."""
+    """Return the servers, those of these names with other slots."""
     return tuple(
         server.model_copy(update={"slots": tuple(slots.get(server.name, server.slots))})
         for server in servers
@@ -447,13 +453,13 @@ def with_slots(
 
 
 def until(server: Server, end_ns: int) -> tuple[Slot, ...]:
-    """A server's slots, the last of which does not end earlier than that."""
+    """Return a server's slots; the last one ends at ``end_ns``, or later, if it did so before."""
     *before, (start, end) = server.slots
     return (*before, (start, max(end, end_ns)))
 
 
 def revised(plan: ChainPlan, **changes: object) -> ChainPlan:
-    """A copy of a plan with some fields replaced, checked. Raises InputError: they make no plan."""
+    """Return a plan with some fields replaced, checked. Raises InputError: they make no plan."""
     values = {name: getattr(plan, name) for name in ChainPlan.model_fields}
     with wrong_values_refused(ChainPlan):
         return ChainPlan.model_validate({**values, **changes})
@@ -480,44 +486,46 @@ def _servers(plan: ChainPlan) -> Wrong:
     homes: dict[Thread, str] = {}
     for place, server in enumerate(plan.servers):
         where = ("servers", place)
-        if server.name in (one.name for one in plan.servers[:place]):
+        if server.name in (earlier.name for earlier in plan.servers[:place]):
             yield f"two servers are named {server.name!r}: rename one", *where, "name"
         for number, slot in enumerate(server.slots):
             if slot[1] > plan.cycle_ns:
-                what = f"the slot {slot_text(slot)} ends after the cycle"
-                reason = f"{what} {duration_text(plan.cycle_ns)}: move or split it"
+                reason = f"the slot {slot_text(slot)} ends after the cycle"
+                reason += f" {duration_text(plan.cycle_ns)}: move or split it"
                 yield reason, *where, "slots", number
         for number, thread in enumerate(server.threads):
             for taken in filter(thread.overlaps, homes):
                 reason = f"{taken.text} is already in server {homes[taken]!r}: write it in one"
                 yield reason, *where, "threads", number
             homes[thread] = server.name
-        for other in plan.servers:
-            above = server.best_effort and not other.best_effort and server.core == other.core
-            if above and server.priority <= other.priority:
-                reason = f"best effort comes behind all others: write more than {other.priority}"
+        for reserved in plan.servers if server.best_effort else ():
+            same_core = not reserved.best_effort and reserved.core == server.core
+            if same_core and server.priority <= reserved.priority:
+                reason = f"best effort comes behind all others: write more than {reserved.priority}"
                 yield reason, *where, "priority"
 
 
 def _overlaps(plan: ChainPlan) -> Wrong:
     """Two servers of one core may overlap only when a priority says who runs, or by turns."""
-    apart = plan.equal_priorities == "apart"
-    for (_, one), (place, two) in combinations(enumerate(plan.servers) if apart else (), 2):
-        if (one.core, one.priority) != (two.core, two.priority):
+    if plan.equal_priorities != "apart":
+        return
+    for (_, first), (place, second) in combinations(enumerate(plan.servers), 2):
+        if (first.core, first.priority) != (second.core, second.priority):
             continue
-        for (number, slot), other in product(enumerate(two.slots), one.slots):
-            if meet(slot, other):
-                reason = f"the slot {slot_text(slot)} overlaps {slot_text(other)} of server"
-                reason += f" {one.name!r} on core {one.core}: move one, or give one server another"
-                yield f"{reason} priority", "servers", place, "slots", number
+        for (number, slot), taken in product(enumerate(second.slots), first.slots):
+            if meet(slot, taken):
+                reason = f"the slot {slot_text(slot)} overlaps {slot_text(taken)} of server"
+                reason += f" {first.name!r} on core {first.core}: move one, or give one server"
+                yield f"{reason} another priority", "servers", place, "slots", number
 
 
 def _shaping_nodes(plan: ChainPlan) -> Wrong:
     output, nodes = plan.chain.output, shaping_nodes(plan)
     for place, node in enumerate(nodes, start=-1 if plan.shaping_node else 0):
         where = ("shaping_node",) if place < 0 else ("further_shaping_nodes", place)
-        others, server = [one for one in nodes if one is not node], server_of(plan, node.thread)
-        if any(node.name == other.name or node.output == other.output for other in others):
+        server = server_of(plan, node.thread)
+        further = [shaping for shaping in nodes if shaping is not node]
+        if any(node.name == shaping.name or node.output == shaping.output for shaping in further):
             reason = f"another one has the name {node.name} or the output {node.output} too: both"
             yield f"{reason} must be its own", *where
         if place < 0 and output not in (None, node.output):
@@ -551,7 +559,7 @@ def _modes(plan: ChainPlan) -> Wrong:
 
 
 def _publisher_threads(plan: ChainPlan) -> Wrong:
-    """A gated asynchronous publisher must not stop, or be stopped by, its process."""
+    """The thread of a gated publisher must not block its process, nor be blocked by it."""
     measured, depth = plan.evidence.longest_send_ns, plan.chain.output_depth
     shortest = max(SHORTEST_SLOT_NS, SENDS_PER_SLOT * (measured or 0))
     took = f" (the longest took {duration_text(measured)})" if measured else ""
@@ -563,15 +571,22 @@ def _publisher_threads(plan: ChainPlan) -> Wrong:
                 reason += f" stopped in a send{took}, it would block the whole process; make it"
                 reason += f" {duration_text(shortest)} or longer (--publish-slot)"
                 yield reason, *where, "slots", number
-        worse = [s for s in plan.servers if s.core == server.core and s.priority > server.priority]
-        for node, other, slot in product(nodes, worse, server.slots):
-            runs_it = any(map(Thread(node=node).overlaps, other.threads))
-            late = (max(slot[0], plan.evidence.min_latency_ns), slot[1])  # nothing comes before
-            if runs_it and late[0] < late[1] and any(meet(late, one) for one in other.slots):
+        worse = [
+            running
+            for running in plan.servers
+            if running.core == server.core and running.priority > server.priority
+        ]
+        for node, running, slot in product(nodes, worse, server.slots):
+            if not any(map(Thread(node=node).overlaps, running.threads)):
+                continue
+            # No output comes before the shortest latency.
+            sends = (max(slot[0], plan.evidence.min_latency_ns), slot[1])
+            if sends[0] < sends[1] and any(meet(sends, runs) for runs in running.slots):
+                worst = running.priority
                 reason = f"the publisher thread of {node} would out-rank its executor, which server"
-                reason += f" {other.name!r} runs at priority {other.priority} in {slot_text(slot)},"
-                reason += f" and spin for its lock: write a number above {other.priority}, or move"
-                yield f"{reason} the slot", *where, "priority"
+                reason += f" {running.name!r} runs at priority {worst} in {slot_text(slot)}, and"
+                reason += f" spin for its lock: write a number above {worst}, or move the slot"
+                yield reason, *where, "priority"
         if plan.overrun == "publish" and plan.policy not in ("shaped", "one-long-slot"):
             reason = f"under {plan.policy} an asynchronous output in its own cycle looks like an"
             reason += " overrun: write wait or discard, or plan with --publication synchronous"
@@ -587,9 +602,9 @@ def _publisher_threads(plan: ChainPlan) -> Wrong:
 def _choices(plan: ChainPlan) -> Wrong:
     gated = any(publisher_servers(plan))
     if plan.into_open_slot == "next-slot" and (gated or plan.policy != "shaped"):
-        found = "a gated publisher" if gated else plan.policy
         reason = "only a shaping node sees when an output comes, under the policy shaped, not"
-        yield f"{reason} {found}: write at-once", "into_open_slot"
+        reason += f" {'a gated publisher' if gated else plan.policy}: write at-once"
+        yield reason, "into_open_slot"
     latest = None if plan.adaptation is None else plan.adaptation.max_latency_ns
     for slot in publish_slots(plan)[-1:]:
         if latest is not None and slot[1] > latest:
@@ -598,27 +613,31 @@ def _choices(plan: ChainPlan) -> Wrong:
 
 
 def below_executors(servers: Sequence[Server]) -> tuple[Server, ...]:
-    """The servers, with those of publishers' threads ranked below what may run at the same time,
-    and those for best effort behind all others of their core.
+    """Return the servers with worse priorities where they have to run behind others of their core.
+
+    Those of publishers' threads run behind all that may run at the same time, those for best effort
+    behind all.
     """
 
-    def behind(server: Server, others: Iterable[Server]) -> Server:
-        worse = (one.priority + 1 for one in others if one.core == server.core)
+    def behind(server: Server, better: Iterable[Server]) -> Server:
+        worse = (above.priority + 1 for above in better if above.core == server.core)
         return server.model_copy(update={"priority": max([server.priority, *worse])})
 
-    publishing = [s for s in servers if any(t.role == "publisher" for t in s.threads)]
-    usual = [one for one in servers if one not in publishing and not one.best_effort]
+    publishing = [
+        server for server in servers if any(thread.role == "publisher" for thread in server.threads)
+    ]
+    running = [server for server in servers if server not in publishing and not server.best_effort]
     ranked = []
-    for one in servers:
-        begins_ns = one.slots[0][0]
-        below = (other for other in usual if other.slots[-1][1] > begins_ns)
-        ranked.append(behind(one, below if one in publishing else ()))
-    rest = [one for one in ranked if not one.best_effort]
-    return tuple(behind(one, rest if one.best_effort else ()) for one in ranked)
+    for server in servers:
+        begins_ns = server.slots[0][0]
+        meanwhile = (executing for executing in running if executing.slots[-1][1] > begins_ns)
+        ranked.append(behind(server, meanwhile) if server in publishing else server)
+    reserved = [server for server in ranked if not server.best_effort]
+    return tuple(behind(server, reserved) if server.best_effort else server for server in ranked)
 
 
 def publisher_servers(plan: ChainPlan) -> Iterator[tuple[int, Server, list[str]]]:
-    """Servers with publishers' threads: place in the plan, server, nodes of these threads."""
+    """Yield servers with publishers' threads: place in the plan, server, nodes of these threads."""
     for number, server in enumerate(plan.servers):
         nodes = [thread.node for thread in server.threads if thread.role == "publisher"]
         if nodes:
@@ -626,7 +645,7 @@ def publisher_servers(plan: ChainPlan) -> Iterator[tuple[int, Server, list[str]]
 
 
 def messages_waiting(plan: ChainPlan, server: Server) -> int:
-    """How many messages may be handed over while a server is closed, in one stretch."""
+    """Return how many messages may be handed over while a server is closed, in one stretch."""
     first, *_ = server.slots
     again = (first[0] + plan.cycle_ns, first[1])
     longest = max(after[0] - before[1] for before, after in pairwise([*server.slots, again]))

@@ -1,34 +1,37 @@
 """What a plan asks of the application and the machine: overruns, publishers, warnings.
 
 An **overrun** is an output that comes behind the last slot it was due in (section 6). A shaping
-node sees them and treats them as the plan says (:mod:`chainshaper.robot.gate`). The thread of
-an asynchronous publisher cannot, but DDS can, by an output's age: with a **lifespan** on the topic,
-what waited for the slot of a later cycle has expired when the thread may run again.
+node sees overruns and treats them as the plan says (:mod:`chainshaper.robot.gate`). The thread of
+an asynchronous publisher does not see them, but DDS can discard them by their age: with a
+**lifespan** on the topic, an output that waited for the slot of a later cycle has expired when the
+thread may run again.
 """
 
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain, combinations, pairwise, product
+from itertools import combinations, pairwise, product
 from typing import NamedTuple
 
 from chainshaper.planning import chain_plan as plans
 from chainshaper.planning.chain_plan import PER_CALLBACK, ChainPlan, ShapingNode, Slot, Thread
-from chainshaper.planning.margins import OVERRUN_PROBABILITY, cycles_needed
+from chainshaper.planning.late_shares import cycles_needed
+from chainshaper.planning.margins import OVERRUN_PROBABILITY
 from chainshaper.values.durations import duration_text, milliseconds
 from chainshaper.values.errors import InputError
 
-IDLE_BAND = 0.02  # of the cycles: a band that has less does next to nothing for the average
+IDLE_BAND = 0.02  # a band with a smaller share of the cycles hardly lowers the average
 NEARLY_FULL = 0.95  # of the cycle; also the kernel's default share for real-time threads
-# How far apart a gate's outputs of one slot are (p0.5–p99.5 measured: 0.02–0.1 ms, see
-# experiments/RESULTS.md), and those of a publisher's thread stopped until its slot (0.02–0.49 ms):
+# How far apart outputs of one slot are: of a gate (p0.5–p99.5 measured: 0.02–0.1 ms, see
+# experiments/RESULTS.md), and of a publisher's thread that is stopped until its slot (0.02–0.49 ms)
 GATE_NS, STOPPED_THREAD_NS = 100_000, 500_000
 ROOMY_SLOT_NS = 10_000_000  # suffices for many sends where the machine stalls for 1 to 8 ms
 
 
 def cycles_until_output(plan: ChainPlan, node: ShapingNode | None = None) -> int:
-    """How many cycles after its own the chain's output, or what ``node`` republishes, is due: under
-    LET per callback, each topic a cycle after the one before it.
+    """Return how many cycles after its own the chain's output is due, or that of a ``node``.
+
+    Under LET per callback each topic is due a cycle after the topic before it.
     """
     if plan.policy == "let-per-chain":
         return 1
@@ -40,18 +43,20 @@ def cycles_until_output(plan: ChainPlan, node: ShapingNode | None = None) -> int
 
 
 class Expected(NamedTuple):
-    """What is seen of outputs that gates let go as slots start, at ``leave_ns`` (all in ns); a
-    plan's prediction counts the ends of slots (eq. 5), the bound of what comes in an open one.
+    """The latencies with which outputs will be seen, which leave when slots start.
+
+    The prediction of a plan counts the ends of slots (eq. 5) instead: the bound for outputs that
+    come while a slot is open.
     """
 
-    leave_ns: tuple[int, ...]
+    leave_ns: tuple[int, ...]  # the start of each slot
     mean_ns: int
     max_ns: int
     jitter_ns: int
 
 
 def expected(plan: ChainPlan) -> Expected | None:
-    """What a plan's outputs will look like; None where no slots give them their places."""
+    """Return the latencies with which a plan's outputs will be seen; None: no slots decide them."""
     leave, shares = tuple(start for start, _ in slots_of_latency(plan)), plan.predicted.shares
     if plan.policy == "one-long-slot" or not 0 < len(leave) == len(shares):
         return None
@@ -61,11 +66,11 @@ def expected(plan: ChainPlan) -> Expected | None:
 
 
 def output_lifespan(plan: ChainPlan) -> int | None:
-    """The lifespan (ns) by which DDS discards what overruns; None where it is not needed.
+    """Return the lifespan (ns) by which DDS discards overruns; None: none is needed.
 
     An output in time waits at most until the end of the first slot, or of the next slot when it
-    just missed one; an overrun with latency l for the first slot of the next cycle, CT + (x_1 − Δ)
-    − l. Under LET, where every output waits for the next cycle, age tells nothing.
+    just missed one. An overrun with latency l waits for the first slot of the next cycle, CT + (x_1
+    − Δ) − l. Under LET, where every output waits for the next cycle, age tells nothing.
     """
     publisher = plan.chain.publisher
     if plan.overrun != "discard" or publisher is None or cycles_until_output(plan):
@@ -77,75 +82,96 @@ def output_lifespan(plan: ChainPlan) -> int | None:
 
 
 def open_until_done(plan: ChainPlan, closed_ns: int = 0) -> ChainPlan:
-    """The plan as back ends and the simulator carry it out: what overruns may finish.
+    """Return the plan as back ends and the simulator carry it out: overruns may finish.
 
     The servers that run the chain to its end stay open until the cycle's end (section 6): stopped
-    at L̄ + ε, the chain would go on in the next cycle, and delay its output too. Where an output
-    that missed its slot is to leave at once, so does the last publish slot of an asynchronous
-    publisher. The slots of other servers of the same core and priority are left out, and the last
-    ``closed_ns`` of a cycle: a thread whose timer expires in these waits for its slot. A stage of a
-    pipeline stays open until the next slot of its core begins.
+    at L̄ + ε, the chain would go on in the next cycle, and delay the output of that as well. Where
+    an output that missed its slot is to leave at once, the last publish slot of an asynchronous
+    publisher stays open, too. The slots of other servers of the same core and priority are left
+    out, and so are the last ``closed_ns`` of a cycle: a thread whose timer expires in these waits
+    for its slot. A stage of a pipeline stays open until the next slot of its core begins.
 
-    Servers of callbacks stay open too, but for one in which chains begin: a callback that was
+    Servers of callbacks stay open too, except those in which chains begin: a callback that was
     stopped would take its next slot, and every output would be late until two short executions met.
-    A server of a whole chain that shapes nothing is there for what runs beside it: it is closed.
-    So are all servers of a plan whose ``slot_ends`` are closed.
+    A server of a whole chain that shapes nothing closes: it is there for the threads that run
+    beside it. So do all servers of a plan whose ``slot_ends`` are closed.
     """
     if plan.slot_ends == "closed":
         return plan
     end_ns = plan.cycle_ns - closed_ns
-    longer: dict[str, Sequence[Slot]] = {}
     if plan.policy == "pipelined" and plan.overrun == "publish":
-        for one in plans.running_servers(plan):
-            same_core = (other.slots for other in plan.servers if other.core == one.core)
-            starts = sorted(start for slots in same_core for start, _ in slots)
-            longer[one.name] = [
-                (start, next((later for later in starts if later >= end), max(end, end_ns)))
-                for start, end in one.slots
-            ]
-        return plans.revised(plan, servers=plans.with_slots(plan.servers, longer))
+        slots = _until_next_stage(plan, end_ns)
+        return plans.revised(plan, servers=plans.with_slots(plan.servers, slots))
     if plan.policy == "server-per-callback":
-        for one in plan.servers:
-            begins = one.slots[0][0] == 0 and len(plan.servers) > 1
-            if not begins and not one.best_effort:
-                longer[one.name] = plans.until(one, end_ns)
+        slots = {}
+        for server in plan.servers:
+            chain_begins = server.slots[0][0] == 0 and len(plan.servers) > 1
+            if not chain_begins and not server.best_effort:
+                slots[server.name] = plans.until(server, end_ns)
         # Not checked: behind what is planned, slots of servers meet.
-        return plan.model_copy(update={"servers": plans.with_slots(plan.servers, longer)})
+        return plan.model_copy(update={"servers": plans.with_slots(plan.servers, slots)})
     if plan.policy not in ("shaped", "one-long-slot") or plans.output_server(plan) is None:
         return plan
-    done, _ = plans.publish_slots(plan)[-1]
-    to_the_end = [
-        one for one in plans.running_servers(plan) if one.slots[-1][0] < done <= one.slots[-1][1]
-    ]
-    at_once = [one for _, one, _ in plans.publisher_servers(plan) if plan.overrun == "publish"]
-    in_turn = [one for one in plan.servers if one in to_the_end or one in at_once]
-    for one in sorted(in_turn, key=lambda server: server.slots[-1][1], reverse=True):
-        taken = [
-            slot
-            for other in plan.servers
-            if other is not one and plan.equal_priorities == "apart"
-            if (other.core, other.priority) == (one.core, one.priority)
-            for slot in longer.get(other.name, other.slots)
-        ]
-        longer[one.name] = slots_without(plans.until(one, end_ns), taken)
+    opened = plans.with_slots(plan.servers, _until_cycle_end(plan, end_ns))
     try:
-        return plans.revised(
-            plan, servers=plans.below_executors(plans.with_slots(plan.servers, longer))
-        )
+        return plans.revised(plan, servers=plans.below_executors(opened))
     except InputError:  # below its executor, a publisher would meet another server's slot
         return plan
 
 
+def _until_next_stage(plan: ChainPlan, end_ns: int) -> dict[str, Sequence[Slot]]:
+    """Return slots of stages that stay open until the next slot of their core, or ``end_ns``."""
+    longer: dict[str, Sequence[Slot]] = {}
+    for stage in plans.running_servers(plan):
+        same_core = (server.slots for server in plan.servers if server.core == stage.core)
+        starts = sorted(start for slots in same_core for start, _ in slots)
+        longer[stage.name] = [
+            (start, next((later for later in starts if later >= end), max(end, end_ns)))
+            for start, end in stage.slots
+        ]
+    return longer
+
+
+def _until_cycle_end(plan: ChainPlan, end_ns: int) -> dict[str, Sequence[Slot]]:
+    """Return slots of the servers that overruns need, open until ``end_ns``, by their names.
+
+    These run a chain to its end; and an asynchronous publisher, if overruns leave at once.
+    """
+    done, _ = plans.publish_slots(plan)[-1]
+    needed = [
+        server
+        for server in plans.running_servers(plan)
+        if server.slots[-1][0] < done <= server.slots[-1][1]
+    ]
+    if plan.overrun == "publish":
+        needed += [server for _, server, _ in plans.publisher_servers(plan)]
+    in_turn = [server for server in plan.servers if server in needed]
+    longer: dict[str, Sequence[Slot]] = {}
+    for opened in sorted(in_turn, key=lambda server: server.slots[-1][1], reverse=True):
+        taken = [
+            slot
+            for server in plan.servers
+            if server is not opened and plan.equal_priorities == "apart"
+            if (server.core, server.priority) == (opened.core, opened.priority)
+            for slot in longer.get(server.name, server.slots)
+        ]
+        longer[opened.name] = slots_without(plans.until(opened, end_ns), taken)
+    return longer
+
+
 def with_output_moved(plan: ChainPlan, by_ns: int) -> ChainPlan:
-    """The plan with the slots of its output moved by so much, and with them the ends of those that
-    run the chain until then. Raises InputError: there they may not be.
+    """Return the plan with the slots of its output moved by so much.
+
+    Slots that run the chain until then begin or end where the moved slots do. Raises InputError:
+    the slots may not be there.
     """
     edges = {edge for slot in plans.publish_slots(plan) for edge in slot}
+
+    def moved(instant: int) -> int:
+        return instant + by_ns if instant in edges else instant
+
     slots = {
-        server.name: [
-            (start + by_ns * (start in edges), end + by_ns * (end in edges))
-            for start, end in server.slots
-        ]
+        server.name: [(moved(start), moved(end)) for start, end in server.slots]
         for server in plan.servers
         if not server.best_effort
     }
@@ -153,7 +179,7 @@ def with_output_moved(plan: ChainPlan, by_ns: int) -> ChainPlan:
 
 
 def why_not_followed(plan: ChainPlan) -> str | None:
-    """Why the slots of a plan cannot follow the latencies, None where they can."""
+    """Say why the slots of a plan cannot follow the latencies; None: they can."""
     if plan.policy != "shaped":
         return f"under {plan.policy} slots are where the policy has them"
     if plan.modes is not None:
@@ -166,23 +192,26 @@ def why_not_followed(plan: ChainPlan) -> str | None:
 
 
 def united(slots: Sequence[Slot]) -> tuple[Slot, ...]:
-    """Slots ascending; those that overlap or touch are one."""
-    found: list[Slot] = []
+    """Return slots ascending; those that overlap or touch are joined."""
+    joined: list[Slot] = []
     for start, end in sorted(slots):
-        first, before = found.pop() if found and start <= found[-1][1] else (start, end)
-        found.append((first, max(end, before)))
-    return tuple(found)
+        if joined and start <= joined[-1][1]:
+            first, before = joined[-1]
+            joined[-1] = first, max(end, before)
+        else:
+            joined.append((start, end))
+    return tuple(joined)
 
 
 def in_cycle(opens_ns: int, closes_ns: int, cycle_ns: int) -> tuple[Slot, ...]:
-    """A slot that repeats every cycle, in one of these: one slot, or two."""
+    """Return a slot that repeats every cycle as it lies inside one cycle: as one slot, or two."""
     start = opens_ns % cycle_ns
     end = start + closes_ns - opens_ns
     return ((start, end),) if end <= cycle_ns else ((0, end - cycle_ns), (start, cycle_ns))
 
 
 def slots_without(slots: Sequence[Slot], taken: Sequence[Slot]) -> tuple[Slot, ...]:
-    """Slots but for what is taken of them."""
+    """Return slots without the parts of them that are taken."""
     left = []
     for start, end in slots:
         free_from = start
@@ -195,48 +224,53 @@ def slots_without(slots: Sequence[Slot], taken: Sequence[Slot]) -> tuple[Slot, .
 
 @dataclass(frozen=True)
 class Writer:
-    """A writer of an application, ``depth`` its history; ``asynchronous``: a thread sends for all
-    such writers of its ``process``. None is: not known.
-    """
+    """A DDS writer of an application. None: not known."""
 
     node: str
     topic: str
-    depth: int | None = None
+    depth: int | None = None  # of its history
+    # Whether a thread of its process sends for it, and for all such writers of the process.
     asynchronous: bool | None = None
     process: int | None = None
 
 
 def check_publication(plan: ChainPlan, writers: Sequence[Writer]) -> list[str]:
-    """What a person must know of a plan that gates the publishers' threads of these writers.
+    """Return what a person must know of a plan that gates the publishers' threads of these writers.
 
-    Raises InputError: the output is published by another node, or synchronously, or its history is
-    too shallow for what is handed over while the thread may not run.
+    Raises InputError: another node publishes the output, or it is published synchronously, or its
+    history is too shallow for the messages that come while the thread may not run.
     """
     warnings: list[str] = []
     output = plan.chain.output
     for _, server, nodes in plans.publisher_servers(plan):
         for node in nodes:
-            own = {writer.topic: writer for writer in writers if writer.node == node}
+            of_node = {writer.topic: writer for writer in writers if writer.node == node}
             if node == plan.chain.publisher and output is not None:
-                _check_output(output, node, own.get(output), plans.messages_waiting(plan, server))
-            processes = {writer.process for writer in own.values()} - {None}
-            beside = (one for one in writers if one.node == node or one.process in processes)
-            others = [
-                one
-                for one in beside
-                if one.asynchronous is not False and (one.node, one.topic) != (node, output)
+                waiting = plans.messages_waiting(plan, server)
+                _check_output(output, node, of_node.get(output), waiting)
+            processes = {writer.process for writer in of_node.values()} - {None}
+            delayed = [
+                writer
+                for writer in writers
+                if writer.node == node or writer.process in processes
+                if writer.asynchronous is not False
+                if (writer.node, writer.topic) != (node, output)
             ]
-            if others:
+            if delayed:
                 doubt = {True: "", None: " (if asynchronous)"}
-                topics = sorted({f"{one.topic}{doubt[one.asynchronous]}" for one in others})
-                said = f"{', '.join(topics)} of {', '.join(sorted({one.node for one in others}))}"
-                said += f" will be delayed as well, until the slots of server {server.name!r}:"
-                remedy = "publish synchronously, or from another process, which has its own thread."
-                warnings.append(f"{said} {remedy}")
+                topics = sorted(
+                    {f"{writer.topic}{doubt[writer.asynchronous]}" for writer in delayed}
+                )
+                names = sorted({writer.node for writer in delayed})
+                warning = f"{', '.join(topics)} of {', '.join(names)} will be delayed as well,"
+                warning += f" until the slots of server {server.name!r}: publish synchronously, or"
+                warning += " from another process, which has its own thread."
+                warnings.append(warning)
     return warnings
 
 
 def _check_output(topic: str, node: str, writer: Writer | None, waiting: int) -> None:
+    """Refuse to gate the thread of a publisher whose writer does not allow it."""
     if writer is None:
         gated = f"{node} is to publish {topic}, but {node} does not publish it"
         raise InputError(f"{gated}: plan again from a recording of this application")
@@ -251,24 +285,22 @@ def _check_output(topic: str, node: str, writer: Writer | None, waiting: int) ->
 
 
 def publication_warnings(plan: ChainPlan) -> list[str]:
-    """What a plan for asynchronous publication asks of the application; one sentence each."""
+    """Say what a plan for asynchronous publication asks of the application; a sentence each."""
     warnings = []
     for _, server, nodes in plans.publisher_servers(open_until_done(plan)):
         names = ", ".join(nodes)
-        said = f"all asynchronous publication is shaped: what else {names} publishes so, such as"
-        warnings.append(f"{said} /rosout, waits for the slots of {server.name!r} too.")
+        warning = f"all asynchronous publication is shaped: what else {names} publishes so, such as"
+        warnings.append(f"{warning} /rosout, waits for the slots of {server.name!r} too.")
         shortest = min(end - start for start, end in server.slots)
         if shortest < ROOMY_SLOT_NS:
-            said = (
-                f"a slot of {duration_text(shortest)} that opens late may end while {names} sends"
-            )
-            said += ", which blocks the whole process until the next one; one of"
-            said += f" {duration_text(ROOMY_SLOT_NS)} (--publish-slot) costs nothing."
-            warnings.append(said)
-        depth, mine = plan.chain.output_depth, plan.chain.publisher in nodes
-        if mine and plan.overrun == "wait" and depth == plans.messages_waiting(plan, server):
-            said = f"a history of {depth} has no room for an output that overran"
-            warnings.append(f"{said}: give it one more.")
+            warning = f"a slot of {duration_text(shortest)} that opens late may end while {names}"
+            warning += " sends, which blocks the whole process until the next one; one of"
+            warning += f" {duration_text(ROOMY_SLOT_NS)} (--publish-slot) costs nothing."
+            warnings.append(warning)
+        depth, runs_output = plan.chain.output_depth, plan.chain.publisher in nodes
+        if runs_output and plan.overrun == "wait" and depth == plans.messages_waiting(plan, server):
+            warning = f"a history of {depth} has no room for an output that overran"
+            warnings.append(f"{warning}: give it one more.")
     if plan.overrun == "discard" and warnings:
         lifespan, topic = output_lifespan(plan), plan.chain.output or "their topic"
         warnings.append(
@@ -281,45 +313,52 @@ def publication_warnings(plan: ChainPlan) -> list[str]:
 
 
 def plan_warnings(*chains: ChainPlan) -> list[str]:
-    """What a person must know before relying on plans; one sentence each, none if all is well."""
-    found = []
+    """Say what a person must know before relying on plans; a sentence each, none if all is well."""
+    warnings = []
     for plan in chains:
-        name = f"{plan.chain.spec or plan.chain.output}: " if chains[1:] else ""
-        about = chain(
-            *(_about_stages(plan), _about_late_outputs(plan), _about_evidence(plan)),
-            _about_receivers(plan),
+        of_plan = (
+            *_about_stages(plan),
+            *_about_late_outputs(plan),
+            *_about_evidence(plan),
+            *_about_receivers(plan),
+            *publication_warnings(plan),
         )
-        found += [f"{name}{warning}" for warning in (*about, *publication_warnings(plan))]
-    return found
+        name = f"{plan.chain.spec or plan.chain.output}: " if len(chains) > 1 else ""
+        warnings += [f"{name}{warning}" for warning in of_plan]
+    return warnings
 
 
 def _about_stages(plan: ChainPlan) -> Iterator[str]:
-    """Where a pipeline is cut, what it costs, and what has to be right for it."""
+    """Say where a pipeline is cut, what it costs, and what has to be right for it."""
     if plan.policy != "pipelined":
         return
     longest, cycle = plan.evidence.max_latency_ns, plan.cycle_ns
     stages = plans.running_servers(plan)
-    where = (f"{', '.join(t.node for t in one.threads)} on core {one.core}" for one in stages)
+    where = (
+        f"{', '.join(thread.node for thread in stage.threads)} on core {stage.core}"
+        for stage in stages
+    )
     cost = _leaves_at(plan) - longest - plan.margin.epsilon_ns
     waits = f"; {milliseconds(cost)} ms of it for stages that wait for their turn" if cost else ""
-    said = f"the chain takes up to {milliseconds(longest)} ms, {longest / cycle:.2f} times its"
-    said += f" cycle, and has {len(stages)} stages: {'; '.join(where)}. Outputs leave at"
-    yield f"{said} {milliseconds(_leaves_at(plan))} ms, once a cycle{waits}."
-    for one, two in combinations(stages, 2):
-        both = product(one.slots, two.slots) if one.core == two.core else ()
-        if any(plans.meet(*pair) for pair in both):
-            said = f"{one.name} and {two.name} have core {one.core} at the same time"
-            yield f"{said}: right only where their callbacks wait rather than compute."
+    warning = f"the chain takes up to {milliseconds(longest)} ms, {longest / cycle:.2f} times its"
+    warning += f" cycle, and has {len(stages)} stages: {'; '.join(where)}. Outputs leave at"
+    yield f"{warning} {milliseconds(_leaves_at(plan))} ms, once a cycle{waits}."
+    for first, second in combinations(stages, 2):
+        if first.core != second.core:
+            continue
+        if any(plans.meet(*slots) for slots in product(first.slots, second.slots)):
+            warning = f"{first.name} and {second.name} have core {first.core} at the same time"
+            yield f"{warning}: right only where their callbacks wait rather than compute."
 
 
 def _leaves_at(plan: ChainPlan) -> int:
-    """When outputs leave, from the start of their chain on, if they come in time."""
+    """Return when outputs that come in time leave, from the start of their chain on (ns)."""
     slots = slots_of_latency(plan)
     return slots[-1][0] if slots else plan.evidence.max_latency_ns + plan.margin.epsilon_ns
 
 
 def evidence_cycles(plan: ChainPlan) -> int:
-    """How many cycles a plan rests on, disturbed ones included."""
+    """Return how many cycles a plan rests on, disturbed ones included."""
     evidence = plan.evidence
     if evidence.all_disturbed:
         return max(evidence.samples, evidence.disturbed)
@@ -327,69 +366,67 @@ def evidence_cycles(plan: ChainPlan) -> int:
 
 
 def _about_late_outputs(plan: ChainPlan) -> Iterator[str]:
-    """Which bands hardly any cycle takes, how many outputs will be late, if the sample tells, and
-    what the machine's stalls cost.
-    """
+    """Say which bands are hardly used, how many outputs will be late, and what stalls cost."""
     evidence, margin, shares = plan.evidence, plan.margin, plan.predicted.shares
     idle = [str(number) for number, share in enumerate(shares, start=1) if share < IDLE_BAND]
     if idle and len(shares) > 1 and plan.modes is None:
-        said = f"bands with less than {IDLE_BAND:.0%} of the cycles: {', '.join(idle)} of"
-        yield f"{said} {len(shares)}: limit --mean-at-most or --max-share, or plan fewer."
+        warning = f"bands with less than {IDLE_BAND:.0%} of the cycles: {', '.join(idle)} of"
+        yield f"{warning} {len(shares)}: limit --mean-at-most or --max-share, or plan fewer."
     cycles, needed = evidence_cycles(plan), cycles_needed(OVERRUN_PROBABILITY)
-    apart = [one.samples + one.disturbed for one in (evidence.modes or {}).values()]
-    fewest = min([cycles, *apart])
+    of_modes = (evidence.modes or {}).values()
+    fewest = min([cycles, *(mode.samples + mode.disturbed for mode in of_modes)])
     independent = margin.independent_cycles
     if independent is not None and independent < needed:
         more = math.ceil(needed * evidence_cycles(plan) / independent)
-        said = f"long cycles come in clusters: {evidence_cycles(plan)} cycles tell as much as"
-        said += f" {independent} independent ones, too few to say how late one output in a hundred"
-        yield f"{said} will be. Record {more} cycles or more."
+        text = f"long cycles come in clusters: {evidence_cycles(plan)} cycles tell as much as"
+        text += f" {independent} independent ones, too few to say how late one output in a hundred"
+        yield f"{text} will be. Record {more} cycles or more."
     elif fewest < needed:
-        of = " of a mode" if fewest < cycles else ""
-        said = f"the sample is small: {fewest} cycles{of} are too few to say how late one output in"
-        yield f"{said} a hundred will be. Record {needed} cycles{of} or more."
+        kind = "cycles of a mode" if fewest < cycles else "cycles"
+        text = f"the sample is small: {fewest} {kind} are too few to say how late one output in"
+        yield f"{text} a hundred will be. Record {needed} {kind} or more."
     stall = evidence.longest_stall_ns
-    what = "" if stall is None else f", longest stall {milliseconds(stall)} ms"
+    stall_text = "" if stall is None else f", longest stall {milliseconds(stall)} ms"
     if evidence.all_disturbed:
-        said = f"the machine disturbed every cycle, but one at most{what}"
-        yield f"{said}: its stalls are in the plan. Record again on a calmer machine."
+        text = f"the machine disturbed every cycle, but one at most{stall_text}"
+        yield f"{text}: its stalls are in the plan. Record again on a calmer machine."
     elif evidence.disturbed:
-        yield f"the machine disturbed {evidence.disturbed} of {cycles} cycles{what}."
+        yield f"the machine disturbed {evidence.disturbed} of {cycles} cycles{stall_text}."
     if margin.stalls_ns:
         end = _leaves_at(plan)
-        said = f"covering the disturbed cycles costs {milliseconds(margin.stalls_ns)} ms: outputs"
-        said += f" leave at {milliseconds(end)} ms; on a machine that does not stall it would be"
-        yield f"{said} {milliseconds(end - margin.stalls_ns)} ms (--ideal-machine)."
+        text = f"covering the disturbed cycles costs {milliseconds(margin.stalls_ns)} ms: outputs"
+        text += f" leave at {milliseconds(end)} ms; on a machine that does not stall it would be"
+        yield f"{text} {milliseconds(end - margin.stalls_ns)} ms (--ideal-machine)."
     late = margin.overrun_probability or 0.0
     if cycles >= needed and late > OVERRUN_PROBABILITY and margin.source != "derived":
-        said = f"by the latencies of all cycles, up to {late:.1%} of the outputs will miss their"
-        yield f"{said} slot ({plan.overrun}): a larger margin (--epsilon) or calmer machine helps."
+        text = f"by the latencies of all cycles, up to {late:.1%} of the outputs will miss their"
+        yield f"{text} slot ({plan.overrun}): a larger margin (--epsilon) or calmer machine helps."
 
 
 def _about_receivers(plan: ChainPlan) -> Iterator[str]:
-    """Who receives an output without a place in the plan, or a promise."""
+    """Say which nodes receive an output without a place in the plan, or a promise."""
     node = plan.shaping_node
     if node is not None and node.receivers and node.receivers_at is None:
-        said = f"{', '.join(node.receivers)}, which get {node.output}, run below all servers, and"
-        said += " when their callbacks start is not promised: the plan has no room for them, or the"
-        yield f"{said} recording does not say how long they take. A core without servers helps."
+        text = f"{', '.join(node.receivers)}, which get {node.output}, run below all servers, and"
+        text += " when their callbacks start is not promised: the plan has no room for them, or the"
+        yield f"{text} recording does not say how long they take. A core without servers helps."
     placed = () if node is None or node.receivers_at is None else node.receivers
     for sink in plan.further_shaping_nodes:
         if not sink.receivers:
             continue
-        said = (
+        text = (
             f"{', '.join(sink.receivers)}, which get {sink.output}, have no place in the plan, as"
         )
-        said += " those that receive a further sink have none: when their callbacks start is not"
+        text += " those that receive a further sink have none: when their callbacks start is not"
         if waiting := [name for name in sink.receivers if name not in placed]:
-            said += f" promised, and {', '.join(waiting)} run below all servers"
+            text += f" promised, and {', '.join(waiting)} run below all servers"
         else:
-            said += f" promised, although they run where those that get {plan.chain.output} do"
-        yield f"{said}. Planned as a chain of its own (--chain instead of --sink) it has a place."
+            text += f" promised, although they run where those that get {plan.chain.output} do"
+        yield f"{text}. Planned as a chain of its own (--chain instead of --sink) it has a place."
     if node is None and plan.chain.output is not None and any(plans.publisher_servers(plan)):
-        said = f"who receives {plan.chain.output} has no place in the plan, since the publisher's"
-        said += " own thread is gated: callbacks of receivers start when their core is free, which"
-        yield f"{said} is not promised. With --publication synchronous they have a place."
+        text = f"who receives {plan.chain.output} has no place in the plan, since the publisher's"
+        text += " own thread is gated: callbacks of receivers start when their core is free, which"
+        yield f"{text} is not promised. With --publication synchronous they have a place."
 
 
 def modes_with_one_slot(plan: ChainPlan) -> Iterator[tuple[tuple[str, ...], Slot]]:
@@ -403,7 +440,7 @@ def modes_with_one_slot(plan: ChainPlan) -> Iterator[tuple[tuple[str, ...], Slot
 
 
 def _about_evidence(plan: ChainPlan) -> Iterator[str]:
-    """What is doubtful about the measurements, or about how much of the cycle is used."""
+    """Say what is doubtful about the measurements, or about how much of the cycle is used."""
     for modes, slot in modes_with_one_slot(plan):
         opens, closes = map(milliseconds, slot)
         yield (
@@ -411,41 +448,41 @@ def _about_evidence(plan: ChainPlan) -> Iterator[str]:
             " longest latencies are too near for two, so outputs leave at the same time in each"
         )
     if plan.modes is not None and plan.evidence.modes is None:
-        said = "nothing says which mode was in force, so the modes share bands of them all"
-        yield f"{said}: one that takes longer is late. Give each one's profile (--mode-profile)."
+        text = "nothing says which mode was in force, so the modes share bands of them all"
+        yield f"{text}: one that takes longer is late. Give each one's profile (--mode-profile)."
     evidence, cycle, margin = plan.evidence, plan.cycle_ns, plan.margin
     longest, used = evidence.max_latency_ns, evidence.utilisation or 0.0
     last = max((end for _, end in plans.publish_slots(plan)), default=longest)
     if evidence.realtime is False:
-        said = "the latencies were taken without real-time scheduling: other programs are in them."
-        yield f"{said} Record again with the privilege to use SCHED_FIFO."
+        text = "the latencies were taken without real-time scheduling: other programs are in them."
+        yield f"{text} Record again with the privilege to use SCHED_FIFO."
     if evidence.lost_events:
-        said = f"{evidence.lost_events} events were lost while recording, maybe the longest"
-        yield f"{said} latency's: record again, see the recording's notes."
+        text = f"{evidence.lost_events} events were lost while recording, maybe the longest"
+        yield f"{text} latency's: record again, see the recording's notes."
     if evidence.interference_ns:
         delay = milliseconds(evidence.interference_ns)
         yield f"{delay} ms of the slot are for other chains, which may have the core first."
     if evidence.incomplete:
-        said = f"{evidence.incomplete} executions of the chain have no end in the recording; their"
-        yield f"{said} latencies, which may be the longest, are not in the plan."
+        text = f"{evidence.incomplete} executions of the chain have no end in the recording; their"
+        yield f"{text} latencies, which may be the longest, are not in the plan."
     if margin.confidence_interval_ns:
         low, high = map(duration_text, margin.confidence_interval_ns)
-        said = f"the margin {high} is the upper end of an estimate from the tail of the latencies"
-        yield f"{said}, which lies between {low} and that."
+        text = f"the margin {high} is the upper end of an estimate from the tail of the latencies"
+        yield f"{text}, which lies between {low} and that."
     if NEARLY_FULL * cycle < last <= cycle:
-        said = f"the plan fills {last / cycle:.1%} of the cycle {duration_text(cycle)}"
-        yield f"{said}: an execution a little longer than any measured delays the next one."
+        text = f"the plan fills {last / cycle:.1%} of the cycle {duration_text(cycle)}"
+        yield f"{text}: an execution a little longer than any measured delays the next one."
     if longest >= cycle and plan.policy != "pipelined":
-        said = f"the longest latency {duration_text(longest)} is not shorter than the cycle"
-        yield f"{said} {duration_text(cycle)}: executions delayed each other while measured."
+        text = f"the longest latency {duration_text(longest)} is not shorter than the cycle"
+        yield f"{text} {duration_text(cycle)}: executions delayed each other while measured."
     if NEARLY_FULL * cycle < longest < cycle:
-        said = f"the longest execution takes more than {NEARLY_FULL:.0%} of a cycle, where the"
-        yield f"{said} kernel throttles real-time threads (/proc/sys/kernel/sched_rt_runtime_us)."
+        text = f"the longest execution takes more than {NEARLY_FULL:.0%} of a cycle, where the"
+        yield f"{text} kernel throttles real-time threads (/proc/sys/kernel/sched_rt_runtime_us)."
     if used > NEARLY_FULL:
         yield f"the chain takes {used:.1%} of its core: latencies will pile up, whatever the slots."
 
 
 def slots_of_latency(plan: ChainPlan) -> tuple[Slot, ...]:
-    """The publish slots as latencies: under LET, and in a pipeline, they are of a later cycle."""
+    """Return the publish slots as latencies: under LET, and in a pipeline, of a later cycle."""
     delay = cycles_until_output(plan) * plan.cycle_ns
     return tuple((start + delay, end + delay) for start, end in plans.publish_slots(plan))

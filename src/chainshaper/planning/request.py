@@ -1,17 +1,16 @@
-"""From what was measured of a chain, and what is wished, to its plan of any policy.
+"""From the profile of a chain, and the wishes of a user, to its plan of any policy.
 
 Further outputs of a chain's graph can be planned with it (``sinks``). A plan is made from latencies
-that were measured while nothing was shaped: shaping a topic that another chain's output waits for
-makes that one later than was measured. Such chains are refused.
+that were measured while nothing was shaped. Shaping a topic that the output of another chain waits
+for makes that output later than it was measured, so such chains are refused.
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
-from functools import partial
 from itertools import combinations, permutations
-from typing import Any, Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +34,7 @@ from chainshaper.planning.chain_plan import (
     Slot,
 )
 from chainshaper.planning.cores import assign_cores
+from chainshaper.planning.latencies import check_latencies
 from chainshaper.planning.offsets import refuse_common
 from chainshaper.planning.pipeline import Work, pipelined, stage_places, work_of
 from chainshaper.planning.profile import (
@@ -53,17 +53,14 @@ from chainshaper.values.plan_choices import Policy, Wishes
 DEFAULT_CORE = 1
 OWN_SLOTS = (*plans.PER_CALLBACK, "let-per-chain")
 """Policies whose plan has no slot behind the chain's, in the same cycle."""
-_LIMITS = ("grid_ns", "max_gap_ns", "max_share")
 
 
 @dataclass(frozen=True)
 class PlanRequest(Wishes):
-    """The wishes for a plan; every field has the default that the command line has.
+    """The wishes for a plan; every field has the default that the command line has."""
 
-    ``modes`` give each mode of the system one of the bands, which may have to be ``found``.
-    """
-
-    modes: Modes | None = None
+    modes: Modes | None = None  # the modes of the system, each with a band
+    # Whether the user gave each mode's band, or it is placed from the latencies in that mode.
     bands_of_modes: Literal["given", "found"] = "given"
 
 
@@ -73,7 +70,7 @@ _STANDARD = PlanRequest()
 def plan_chain(
     profile: Profile, request: PlanRequest = _STANDARD, sinks: Sequence[Profile] = ()
 ) -> ChainPlan:
-    """The plan of the requested policy for a measured chain.
+    """Plan a measured chain by the requested policy.
 
     ``sinks`` are profiles of further outputs of the same graph, each of which is shaped too.
 
@@ -99,77 +96,96 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
     if not keeps_places(request):
         profile = without_reception(profile)
     profile, *sinks = _prepared((profile, *map(without_reception, sinks)), request)
-    if (modes := request.modes) is not None and profile.of_modes and request.policy == "shaped":
-        profile, margin, modes, finish = _together(profile, request, modes)
-    else:
-        finish = partial(_with_policy, profile=profile, request=request)
+    modes = request.modes
+    if modes is not None and profile.of_modes and request.policy == "shaped":
+        placed = _placed_modes(profile, request, modes)
+        profile, modes = placed.profile, placed.modes
+        plan = _shaped(profile, request, placed.margin, sinks)
+        plan = with_modes(plan, modes, placed.slots, placed.evidence)
+    elif request.policy in OWN_SLOTS:
         margin = _margin(profile, request)
-    longest, period = profile.longest_ns, profile.period_ns
-    if request.policy == "let-per-chain" and longest >= period:
-        reason = f"LET per chain has to be done in the period {duration_text(period)}, and the"
-        reason += f" longest latency is {duration_text(longest)}"
-        raise OperationError(f"{reason}: plan LET per callback, or a longer period")
-    measured = profile
-    if request.policy in OWN_SLOTS:  # shaping, only the start of the plan, must fit into a cycle
-        length = _slot_ns(profile, request)
-        if (most := period - margin.epsilon_ns - length) < 1:
-            both = f"margin {duration_text(margin.epsilon_ns)} and the publish slot"
-            reason = (
-                f"{duration_text(length)} leave nothing of the cycle of {duration_text(period)}"
-            )
-            raise OperationError(
-                f"the {both} {reason}: plan with a shorter slot, or smaller margin"
-            )
-        latencies = np.minimum(margins.check_latencies(profile.latencies_ns), most)
-        measured = replace(profile, latencies_ns=latencies)
-    plan = finish(_shaped(measured, request, margin, sinks))
-    if request.policy in OWN_SLOTS:
-        own = shaping.evidence_of(profile.latencies_ns, interference_ns=profile.interference_ns)
-        figures = own.model_dump(exclude_unset=True)
-        plan = plans.revised(plan, evidence=plan.evidence.model_copy(update=figures))
+        start = _fitting_into_cycle(profile, request, margin)
+        plan = _with_policy(_shaped(start, request, margin, sinks), profile, request)
+        plan = _with_evidence_of(plan, profile)
+    else:
+        plan = _shaped(profile, request, _margin(profile, request), sinks)
+        plan = _with_policy(plan, profile, request)
     for sink in sinks:
         if not sink.topics:
             raise InputError("a sink needs the topic it is published on: plan from a recording")
-        ends, receivers = sink.topics[-1], sink.receivers if request.with_receivers else ()
         plan = shaping.with_sink(
-            plan, sink.latencies_ns, ends, publisher=sink.last, receivers=receivers
+            plan,
+            sink.latencies_ns,
+            sink.topics[-1],
+            publisher=sink.last,
+            receivers=sink.receivers if request.with_receivers else (),
         )
     no_process = plan.shaping_node is None or plan.shaping_node.in_process
     if request.fallback != _STANDARD.fallback and no_process:
         reason = f"--fallback {request.fallback} is for a shaping node that is a process"
         raise InputError(f"{reason}: leave it out, or plan with --publication synchronous")
-    plan = shaping.with_executors(plan, [one.executors for one in (profile, *sinks)])
+    plan = shaping.with_executors(plan, [output.executors for output in (profile, *sinks)])
     plan = plans.revised(plan, modes=modes, slot_ends=request.slot_ends)
     plan = shaping.with_turns(plan, request.equal_priorities)
     (plan,) = with_receivers_placed([plan], [profile])
     return shaping.with_best_effort([plan], best_effort_cores([profile], request))[0]
 
 
+def _fitting_into_cycle(profile: Profile, request: PlanRequest, margin: Margin) -> Profile:
+    """Return a profile with which shaping fits into a cycle, for a policy with slots of its own.
+
+    Shaping is only the start of such a plan: the policy replaces its slots afterwards.
+    """
+    longest, period = profile.longest_ns, profile.period_ns
+    if request.policy == "let-per-chain" and longest >= period:
+        reason = f"LET per chain has to be done in the period {duration_text(period)}, and the"
+        reason += f" longest latency is {duration_text(longest)}"
+        raise OperationError(f"{reason}: plan LET per callback, or a longer period")
+    length = _slot_ns(profile, request)
+    most = period - margin.epsilon_ns - length
+    if most < 1:
+        reason = f"the margin {duration_text(margin.epsilon_ns)} and the publish slot"
+        reason += f" {duration_text(length)} leave nothing of the cycle of {duration_text(period)}"
+        raise OperationError(f"{reason}: plan with a shorter slot, or smaller margin")
+    return replace(profile, latencies_ns=np.minimum(check_latencies(profile.latencies_ns), most))
+
+
+def _with_evidence_of(plan: ChainPlan, profile: Profile) -> ChainPlan:
+    """Return a plan with the latencies as they were measured, not as they fit into a cycle."""
+    measured = shaping.evidence_of(profile.latencies_ns, interference_ns=profile.interference_ns)
+    figures = measured.model_dump(exclude_unset=True)
+    return plans.revised(plan, evidence=plan.evidence.model_copy(update=figures))
+
+
 def keeps_places(request: PlanRequest) -> bool:
-    """Whether a plan keeps places for those that receive what shaping nodes publish."""
+    """Whether a plan has places for the nodes that receive what shaping nodes publish."""
     gates = request.policy not in UNSHAPED and request.publication != "asynchronous"
     return gates and request.with_receivers
 
 
-def _prepared(every: Sequence[Profile], request: PlanRequest) -> list[Profile]:
-    """The profiles of a chain, and of its sinks, with the latencies that they are planned from."""
+def _prepared(profiles: Sequence[Profile], request: PlanRequest) -> list[Profile]:
+    """Return profiles of a chain and its sinks with the latencies that they are planned from."""
     if request.percentile is not None:
-        every = [up_to(one, request.percentile) for one in every]
-    every = [_apart(one) for one in every] if request.policy == "pipelined" else every
-    every, _ = on_cores(every, request)
-    every = with_interference(every, [range(len(every))], request, at_once=False)
-    return [_covered(one, request) for one in every]
+        profiles = [up_to(profile, request.percentile) for profile in profiles]
+    if request.policy == "pipelined":
+        profiles = [_apart(profile) for profile in profiles]
+    profiles, _ = on_cores(profiles, request)
+    profiles = with_interference(profiles, [range(len(profiles))], request, at_once=False)
+    return [_covered(profile, request) for profile in profiles]
 
 
 def _apart(profile: Profile) -> Profile:
-    """The profile of a chain whose instances do not overlap: what its callbacks took, in sum, or,
-    where branches join, on the longest way.
+    """Return the profile of a chain as if its instances did not overlap, to be cut into stages.
+
+    A latency is the sum of what its callbacks took, or, where branches join, that on the longest
+    way.
     """
     name = profile.name or "a chain"
     if not profile.steps_ns.size:
         raise InputError(f"{name}: stages are cut by what callbacks took: plan from a recording")
     if not profile.graph_steps_ns.size:
-        if beside := sorted(Counter(p.node for p in profile.callbacks) - Counter(profile.nodes)):
+        nodes = Counter(callback.node for callback in profile.callbacks)
+        if beside := sorted(nodes - Counter(profile.nodes)):
             reason = f"{name} waits for {', '.join(beside)} beside it, and what these took"
             raise InputError(f"{reason} is not known: plan from a recording")
         return alone(profile)
@@ -186,51 +202,60 @@ def _apart(profile: Profile) -> Profile:
 
 
 def _work(profile: Profile, steps_ns: NDArray[np.int64]) -> Work:
-    """What a pipeline is made of: these steps, of the chain or, with branches, of the graph."""
+    """Return what a pipeline is cut from: steps of the chain, or of a graph with branches."""
     if not profile.graph_steps_ns.size:
-        along = [range(k - 1, k) if k else () for k in range(len(profile.nodes))]
+        along = [range(place - 1, place) if place else () for place in range(len(profile.nodes))]
         return work_of(profile.nodes, along, steps_ns, [0] * len(along))
     callbacks = profile.callbacks
-    nodes, first = [one.node for one in callbacks], profile.topics[0]
-    begins = next(
-        k
-        for k, one in enumerate(callbacks)
-        if (one.node, one.publishes) == (profile.nodes[0], first)
+    nodes, first_topic = [callback.node for callback in callbacks], profile.topics[0]
+    first_place = next(
+        place
+        for place, callback in enumerate(callbacks)
+        if (callback.node, callback.publishes) == (profile.nodes[0], first_topic)
     )
-    return work_of(nodes, [one.after for one in callbacks], steps_ns, profile.begins_ns, begins)
+    return work_of(
+        nodes, [callback.after for callback in callbacks], steps_ns, profile.begins_ns, first_place
+    )
 
 
 def best_effort_cores(
     profiles: Sequence[Profile], request: PlanRequest, core_of: Mapping[str, int] | None = None
 ) -> dict[str, int]:
-    """The core of each node that is best effort: its own, or the first chain's, by ``core_of``."""
+    """Return the core of each node that is best effort: where it was recorded, or with a chain.
+
+    A node without a core is on that of the first chain's last node, by ``core_of`` (default: where
+    that was recorded).
+    """
     if not request.best_effort:
         return {}
-    cores = {node: core for one in profiles for node, core in one.cores.items()}
+    cores = {node: core for profile in profiles for node, core in profile.cores.items()}
     homes = core_of or profiles[0].core_of
     last = (profiles[0].last if profiles else None) or ""
-    chain = homes.get(last, next(iter(homes.values()), DEFAULT_CORE))
+    chain_core = homes.get(last, next(iter(homes.values()), DEFAULT_CORE))
     names = ["/" + name.strip("/") for name in request.best_effort]
-    known = sorted({node for one in profiles for node in one.every_node})
+    known = sorted({node for profile in profiles for node in profile.every_node})
     for name in names if known else ():
         if name not in known:
             near = " or ".join(get_close_matches(name, known) or known[:5])
             raise InputError(f"--best-effort {name}: no node of the recording, name {near}")
-    return {name: cores.get(name, chain) for name in names}
+    return {name: cores.get(name, chain_core) for name in names}
 
 
 def _places(profiles: Sequence[Profile], cores: Sequence[int]) -> dict[str, int]:
-    """The place in ``cores`` of the stage that each node of a pipeline is in."""
+    """Return the place in ``cores`` of the stage that each node of a pipeline is in."""
     places: dict[str, int] = {}
-    for one in profiles:
-        apart = _apart(one)
+    for profile in profiles:
+        apart = _apart(profile)
         steps = apart.graph_steps_ns if apart.graph_steps_ns.size else apart.steps_ns
-        places |= stage_places(_work(apart, steps), one.period_ns, len(cores))
+        places |= stage_places(_work(apart, steps), profile.period_ns, len(cores))
     return places
 
 
 def stages_before(profiles: Sequence[Profile], request: PlanRequest) -> dict[str, int]:
-    """How many stages of a pipeline are more urgent than a node's, where cores are named twice."""
+    """Return how many stages of a pipeline are more urgent than each node's on its core.
+
+    Only where the wished cores name one twice, several stages share it.
+    """
     if request.policy != "pipelined" or request.cores is None:
         return {}
     cores, places = request.cores, _places(profiles, request.cores)
@@ -243,25 +268,26 @@ def cores_for(
     request: PlanRequest = _STANDARD,
     worth: float = 0.0,
 ) -> dict[str, int]:
-    """The core of each node of these chains, see :func:`~chainshaper.planning.cores.assign_cores`
-    and, for stages, :func:`.stage_places`. Raises InputError: a profile is bare latencies.
+    """Return the core of each node of these chains.
+
+    See :func:`~chainshaper.planning.cores.assign_cores` and, for stages, :func:`.stage_places`.
+    Raises InputError: a profile is bare latencies.
     """
     for profile in profiles:
         if not profile.callbacks:
             reason = f"--cores distributes callbacks, and latencies do not say {profile.name}'s"
             raise InputError(f"{reason}: plan from a recording")
     if request.policy == "pipelined":
-        return {node: cores[k] for node, k in _places(profiles, cores).items()}
-    least = margins.least_epsilon_ns(request.publication)
-    margin = least if request.epsilon_ns is None else request.epsilon_ns
-    return assign_cores(profiles, cores, margin_ns=margin, worth=worth)
+        return {node: cores[place] for node, place in _places(profiles, cores).items()}
+    margin_ns = margins.given_or_least_epsilon_ns(request)
+    return assign_cores(profiles, cores, margin_ns=margin_ns, worth=worth)
 
 
 def on_cores(
     profiles: Sequence[Profile], request: PlanRequest
 ) -> tuple[tuple[Profile, ...], list[str]]:
-    """The profiles with their executors on the wished cores, and whose latency is another there."""
-    if request.cores is None or request.policy == "pipelined":  # there, stages get them
+    """Move the executors to the wished cores; say of which chains the latency changes by that."""
+    if request.cores is None or request.policy == "pipelined":  # a pipeline's stages get the cores
         return tuple(profiles), []
     return moved_to(profiles, request.cores, cores_for(profiles, request.cores, request))
 
@@ -269,36 +295,41 @@ def on_cores(
 def moved_to(
     profiles: Sequence[Profile], cores: Sequence[int], core_of: Mapping[str, int]
 ) -> tuple[tuple[Profile, ...], list[str]]:
-    """The profiles with nodes on these of the wished cores, and whose latency is another there."""
+    """Move nodes to ``core_of``, out of ``cores``; say of which chains the latency changes by that.
+
+    It does where executors that shared a core do so no longer, or the other way round.
+    """
     moved, doubts = [], []
-    for one in profiles:
-        own = {node: core_of[node] for node in one.core_of}
-        homes = {(own[node], core) for node, core in one.core_of.items()}
-        if not len(homes) == len(set(own.values())) == len(set(one.core_of.values())):
-            said = f"{one.name} was measured with its executors on cores in another way than"
-            said += " planned, which is another latency: measure it so (`chainshaper profile"
-            doubts.append(f"{said} --cores {','.join(map(str, cores))}`)")
-        callbacks = tuple(replace(each, core=core_of[each.node]) for each in one.callbacks)
-        moved.append(replace(one, core_of=own, callbacks=callbacks))
+    for profile in profiles:
+        new_cores = {node: core_of[node] for node in profile.core_of}
+        homes = {(new_cores[node], core) for node, core in profile.core_of.items()}
+        if not len(homes) == len(set(new_cores.values())) == len(set(profile.core_of.values())):
+            doubt = f"{profile.name} was measured with its executors on cores in another way than"
+            doubt += " planned, which is another latency: measure it so (`chainshaper profile"
+            doubts.append(f"{doubt} --cores {','.join(map(str, cores))}`)")
+        callbacks = tuple(
+            replace(callback, core=core_of[callback.node]) for callback in profile.callbacks
+        )
+        moved.append(replace(profile, core_of=new_cores, callbacks=callbacks))
     return tuple(moved), doubts
 
 
 def band_choice(
     plan: ChainPlan, profile: Profile, request: PlanRequest, sinks: Sequence[Profile] = ()
 ) -> BandChoice:
-    """The curve of figure 7 for a plan that :func:`plan_chain` made of this, and what ``auto``
-    takes from it.
-    """
-    latencies = _prepared((profile, *sinks), request)[0].measured
-    return choose_bands(plan, latencies, **_of(request, *_LIMITS, "least_gain"))
-
-
-def _of(one: PlanRequest | Profile, *names: str) -> dict[str, Any]:
-    return {name: getattr(one, name) for name in names}
+    """Return how ``auto`` chose the bands of a plan that :func:`plan_chain` made of the same."""
+    return choose_bands(
+        plan,
+        _prepared((profile, *sinks), request)[0].measured,
+        least_gain=request.least_gain,
+        grid_ns=request.grid_ns,
+        max_gap_ns=request.max_gap_ns,
+        max_share=request.max_share,
+    )
 
 
 def _covered(profile: Profile, request: PlanRequest) -> Profile:
-    """Where no cycle was undisturbed, the profile of those that a margin would cover."""
+    """Return the profile of the cycles that a margin would cover, where none was undisturbed."""
     if not profile.all_disturbed:
         return profile
     if request.ideal_machine:
@@ -308,25 +339,24 @@ def _covered(profile: Profile, request: PlanRequest) -> Profile:
     if request.percentile is not None:  # what takes longer has been left out
         return profile
     every = profile.every
-    covered = every[every <= _covering(every, profile, request)]
-    latencies = covered if covered.size > 1 else every  # none fits, which the planner refuses
+    latest_slot_ns = _latest_slot_ns(profile, request)
+    covered = every[every <= margins.covering_latency(every, request, latest_slot_ns)]
+    latencies = covered if covered.size > 1 else every  # no slot fits, which the planner refuses
     return replace(profile, latencies_ns=latencies, every_latency_ns=every)
 
 
-def _covering(latencies: NDArray[np.int64], profile: Profile, request: PlanRequest) -> int:
-    """The latency that covers all of these but the promised share, as far as a publish slot fits
-    into the cycle behind it.
-    """
-    least_ns = margins.least_epsilon_ns(request.publication) + _slot_ns(profile, request)
-    latest = None if request.policy in OWN_SLOTS else profile.period_ns - least_ns
-    share = request.overrun_probability or margins.OVERRUN_PROBABILITY
-    independent = margins.independent_cycles(latencies)
-    return margins.covered_latency(latencies, share, latest, independent)
+def _latest_slot_ns(profile: Profile, request: PlanRequest) -> int | None:
+    """Return when the publish slot has to begin to end in the cycle; None: the policy places it."""
+    if request.policy in OWN_SLOTS:
+        return None
+    return profile.period_ns - _slot_ns(profile, request)
 
 
 def _slot_ns(profile: Profile, request: PlanRequest) -> int:
-    """Δ, long enough for a publication (eq. 2 and 4): given, or as long as the longest measured,
-    1 ms at least; several sends of an asynchronous publisher, whose thread must not stop in one.
+    """Return Δ, the length of the publish slot, long enough for a publication (eq. 2 and 4).
+
+    Unless it is given, it is the longest publication measured, 1 ms at least. An asynchronous
+    publisher's thread must not stop in a send, so its slot is as long as several.
     """
     if request.publish_slot_ns is not None:
         return request.publish_slot_ns
@@ -340,9 +370,11 @@ def _slot_ns(profile: Profile, request: PlanRequest) -> int:
 def place_modes(
     starts_ns: Mapping[str, int], length_ns: int, given: Mapping[str, int] | None = None
 ) -> tuple[dict[str, int], tuple[Slot, ...]]:
-    """The band of each mode, and the slots: each behind the one before, when all outputs of its
-    modes may leave (from L̄ + ε of the cycles that began in a mode on: eq. 1 for each by itself).
-    Unless bands are ``given``, slots that would overlap are one.
+    """Return the band of each mode, from 1 on, and the slots.
+
+    ``starts_ns`` is when the outputs of each mode may leave: at L̄ + ε of the cycles that began in
+    it (eq. 1 for each mode by itself). A slot begins when the outputs of all its modes may leave,
+    behind the slot before it. Unless the bands are ``given``, slots that would overlap are joined.
     """
     first, band, bands = 0, 0, dict(given or {})
     for mode in () if given else sorted(starts_ns, key=starts_ns.__getitem__):
@@ -353,8 +385,8 @@ def place_modes(
     for band in range(1, max(bands.values()) + 1):
         if band not in bands.values():
             raise InputError(f"no mode has the band {band}: number them from 1 on, or leave it out")
-        own = (start for mode, start in starts_ns.items() if bands[mode] == band)
-        start = max(*own, slots[-1][1] if slots else 0)
+        of_modes = (start for mode, start in starts_ns.items() if bands[mode] == band)
+        start = max(*of_modes, slots[-1][1] if slots else 0)
         slots.append((start, start + length_ns))
     return bands, tuple(slots)
 
@@ -362,14 +394,14 @@ def place_modes(
 def with_modes(
     plan: ChainPlan, modes: Modes, slots: tuple[Slot, ...], measured: Mapping[str, Evidence]
 ) -> ChainPlan:
-    """A shaped plan with slots for modes of which each was measured.
+    """Return a shaped plan with slots for modes, each of which was measured.
 
-    The prediction of the whole is for modes in force as often as they were measured.
+    The prediction is for modes that are in force as often as they were when measured.
     """
     cycles = [0] * len(slots)
-    for mode, own in measured.items():
-        cycles[modes.bands[mode] - 1] += own.samples
-    shares = tuple(own / sum(cycles) for own in cycles)
+    for mode, of_mode in measured.items():
+        cycles[modes.bands[mode] - 1] += of_mode.samples
+    shares = tuple(count / sum(cycles) for count in cycles)
     predicted = Prediction(
         mean_ns=round(sum(share * end for share, (_, end) in zip(shares, slots, strict=True))),
         max_ns=slots[-1][1],
@@ -381,42 +413,66 @@ def with_modes(
     return with_publish_slots(plan, slots, evidence=evidence, predicted=predicted, modes=modes)
 
 
-def _together(
-    profile: Profile, request: PlanRequest, modes: Modes
-) -> tuple[Profile, Margin, Modes, Callable[[ChainPlan], ChainPlan]]:
-    """The profile of all modes, the margin up to their last slot, the modes with bands, and what
-    gives a plan the slots.
-    """
-    apart = {mode: _covered(profile.of_modes[mode], request) for mode in modes.bands}
-    own = {mode: _margin(one, request) for mode, one in apart.items()}
-    starts = {mode: one.longest_ns + own[mode].epsilon_ns for mode, one in apart.items()}
+class _PlacedModes(NamedTuple):
+    """The modes of a system with slots, each from the latencies that were measured in it."""
+
+    profile: Profile  # of the cycles in all modes
+    margin: Margin  # from the longest latency in any mode to the last slot
+    modes: Modes  # with their bands
+    slots: tuple[Slot, ...]  # of the bands
+    evidence: Mapping[str, Evidence]  # of each mode
+
+
+def _placed_modes(profile: Profile, request: PlanRequest, modes: Modes) -> _PlacedModes:
+    """Place the slots of modes, each of which was measured."""
+    profiles = {mode: _covered(profile.of_modes[mode], request) for mode in modes.bands}
+    margin_of = {mode: _margin(of_mode, request) for mode, of_mode in profiles.items()}
+    starts = {
+        mode: of_mode.longest_ns + margin_of[mode].epsilon_ns for mode, of_mode in profiles.items()
+    }
     given = None if request.bands_of_modes == "found" else modes.bands
     bands, slots = place_modes(starts, _slot_ns(profile, request), given)
-    modes = modes.model_copy(update={"bands": bands})
     why = f"but each mode's slot is placed from its own latencies, here {len(slots)}: leave it out"
     _refuse_placement(replace(request, bands=1) if request.bands == len(slots) else request, why)
-    measured = {}
-    for mode, one in apart.items():
-        conditions = _of(one, "recording", "disturbed", "all_disturbed")
-        measured[mode] = shaping.evidence_of(one.latencies_ns, **conditions)
-    both = replace(
+    together = replace(
         profile,
-        latencies_ns=np.concatenate([one.latencies_ns for one in apart.values()]),
-        every_latency_ns=np.concatenate([one.every for one in apart.values()]),
-        disturbed=sum(one.disturbed for one in apart.values()),
-        all_disturbed=any(one.all_disturbed for one in apart.values()) or None,
+        latencies_ns=np.concatenate([of_mode.latencies_ns for of_mode in profiles.values()]),
+        every_latency_ns=np.concatenate([of_mode.every for of_mode in profiles.values()]),
+        disturbed=sum(of_mode.disturbed for of_mode in profiles.values()),
+        all_disturbed=any(of_mode.all_disturbed for of_mode in profiles.values()) or None,
     )
-    late = [margin.overrun_probability or 0.0 for margin in own.values()]
-    last = {"epsilon_ns": slots[-1][0] - both.longest_ns, "overrun_probability": max(late) or None}
-    margin = own[max(starts, key=starts.__getitem__)].model_copy(update=last)
-    return both, margin, modes, partial(with_modes, modes=modes, slots=slots, measured=measured)
+    latest_mode = max(starts, key=starts.__getitem__)
+    late = max(margin.overrun_probability or 0.0 for margin in margin_of.values())
+    return _PlacedModes(
+        together,
+        margin_of[latest_mode].model_copy(
+            update={
+                "epsilon_ns": slots[-1][0] - together.longest_ns,
+                "overrun_probability": late or None,
+            }
+        ),
+        modes.model_copy(update={"bands": bands}),
+        slots,
+        {
+            mode: shaping.evidence_of(
+                of_mode.latencies_ns,
+                recording=of_mode.recording,
+                disturbed=of_mode.disturbed,
+                all_disturbed=of_mode.all_disturbed,
+            )
+            for mode, of_mode in profiles.items()
+        },
+    )
 
 
 def _shaped(
     profile: Profile, request: PlanRequest, margin: Margin, sinks: Sequence[Profile]
 ) -> ChainPlan:
+    """Return a plan that shapes a chain in one slot, from which plans of all policies are made."""
     last = profile.last
-    values = {n: getattr(profile, n) for n in Evidence.model_fields if hasattr(profile, n)}
+    values = {
+        name: getattr(profile, name) for name in Evidence.model_fields if hasattr(profile, name)
+    }
     if request.publication == "asynchronous":
         if profile.asynchronous is False:
             reason = f"{last} has no thread that publishes for it: plan with --publication"
@@ -428,12 +484,15 @@ def _shaped(
         reason += f" {last}, where no gate before DDS sees them: switch that off, or plan with"
         raise InputError(f"{reason} --publication synchronous, and splice with --node cpp")
     unused = "publication" if request.publication == "asynchronous" else "send"
-    del values[f"longest_{unused}_ns"]  # no evidence for it
+    del values[f"longest_{unused}_ns"]  # nothing is published in that way
     length = _slot_ns(profile, request)
-    found = "measured" if length > plans.SHORTEST_SLOT_NS else "least"
-    values["publish_slot"] = found if request.publish_slot_ns is None else "given"
-    # At once by default, unless the thread of an asynchronous publisher has outputs due later.
-    bound = request.publication == "asynchronous" and request.policy in OWN_SLOTS
+    if request.publish_slot_ns is not None:
+        values["publish_slot"] = "given"
+    else:
+        values["publish_slot"] = "measured" if length > plans.SHORTEST_SLOT_NS else "least"
+    # By default an output that overran leaves at once. The thread of an asynchronous publisher,
+    # whose outputs are due in a later cycle, would publish outputs too early.
+    waits = request.publication == "asynchronous" and request.policy in OWN_SLOTS
     plan = shaping.plan_shaping(
         profile.latencies_ns,
         profile.period_ns,
@@ -445,13 +504,15 @@ def _shaped(
         publisher=last,
         nodes=tuple(dict.fromkeys(profile.nodes)),
         core=profile.core_of.get(last or "", DEFAULT_CORE),
-        overrun=request.overrun or ("wait" if bound else "publish"),
+        overrun=request.overrun or ("wait" if waits else "publish"),
         fifo_priority=profile.fifo_priority,
         receivers=profile.receivers if request.with_receivers else (),
         max_of_all_ns=int(profile.every.max()),
         **values,
     )
-    core_of = {node: core for one in (profile, *sinks) for node, core in one.core_of.items()}
+    core_of = {
+        node: core for planned in (profile, *sinks) for node, core in planned.core_of.items()
+    }
     if request.first_slot_ns is not None:
         if not profile.nodes:
             raise InputError("a slot for the first node needs the chain's nodes: give a recording")
@@ -463,120 +524,75 @@ def _shaped(
 
 
 def _margin(profile: Profile, request: PlanRequest) -> Margin:
-    every, longest, probability = profile.every, profile.longest_ns, request.overrun_probability
-    independent = margins.independent_cycles(every)
-    clustered = independent if independent < every.size else None
-    if request.epsilon_ns is not None:
-        if request.epsilon_ns < 0:
-            raise InputError("epsilon must be 0 ms or more")
-        way = 0 if request.publication == "in-process" else margins.HOP_NS
-        in_time = longest + max(0, request.epsilon_ns - way)
-        late = margins.late_share(every, in_time, independent)
-        return Margin(
-            epsilon_ns=request.epsilon_ns, overrun_probability=late, independent_cycles=clustered
-        )
-    covered = profile.latencies_ns if request.ideal_machine else every
-    # No margin covers cycles for a slot that stands elsewhere, or those that have been left out.
-    covers = request.policy not in OWN_SLOTS or request.policy == "pipelined"
-    covers &= request.percentile is None
-    if probability is not None and covers:
-        return _asked_margin(covered, profile, request, probability, independent)
-    stalls = max(0, _covering(covered, profile, request) - longest) if covers else 0
-    all_covered = covers and not request.ideal_machine
-    late = _late_by_default(every, longest, stalls, independent, all_covered=all_covered)
-    if probability is not None and late > probability:
-        reason = f"up to {late:.2g} of the outputs will be late, more than {probability:g}"
-        remedy = "the margin covers no share with --percentile, nor where slots are a policy's own"
-        raise OperationError(f"{reason}: {remedy}. Leave out --overrun-probability")
-    return Margin(
-        epsilon_ns=margins.least_epsilon_ns(request.publication) + stalls,
-        source="measured",
-        overrun_probability=late,
-        stalls_ns=stalls,
-        independent_cycles=clustered,
+    """Return the margin behind the longest latency that a chain is planned from."""
+    return margins.planned_margin(
+        profile.latencies_ns,
+        profile.every,
+        request,
+        latest_slot_ns=_latest_slot_ns(profile, request),
+        decides_slot=request.policy not in OWN_SLOTS or request.policy == "pipelined",
     )
-
-
-def _asked_margin(
-    covered: NDArray[np.int64],
-    profile: Profile,
-    request: PlanRequest,
-    probability: float,
-    independent: int,
-) -> Margin:
-    """The margin for a share of late outputs that was asked for, of the cycles that are covered;
-    where others are late besides, with the share of all."""
-    longest, least = profile.longest_ns, margins.least_epsilon_ns(request.publication)
-    margin = margins.derive_margin(
-        covered, probability, request.seed, longest_ns=longest, least_ns=least
-    )
-    in_time = longest + margin.epsilon_ns - least
-    if not request.ideal_machine or not np.any(profile.every > in_time):
-        return margin
-    late = margins.late_share(profile.every, in_time, independent)
-    return margin.model_copy(update={"overrun_probability": late})
-
-
-def _late_by_default(
-    every: NDArray[np.int64], longest: int, stalls: int, independent: int, *, all_covered: bool
-) -> float:
-    """The share of outputs that will be late where the least margin is behind ``longest + stalls``.
-
-    It is counted from the latencies themselves: what the least margin adds is the way to the
-    shaping node, and how many cycles end within it is an accident of the sample. Where the usual
-    share is covered, that is promised, or what is smaller by a confidence that leaves no doubt.
-    """
-    usual = margins.OVERRUN_PROBABILITY
-    if all_covered and independent >= margins.cycles_needed(usual):
-        rank = margins.covering_rank(independent, usual)  # fixed before the sample was seen
-        if longest + stalls >= np.sort(every)[-rank]:
-            beyond = rank - 1 if stalls else int(np.count_nonzero(every > longest))
-            return min(usual, margins.most_probable(beyond, independent, margins.WELL_COVERED))
-    return margins.late_share(every, longest + stalls, independent)
 
 
 def _with_policy(plan: ChainPlan, profile: Profile, request: PlanRequest) -> ChainPlan:
+    """Return the plan of the requested policy, made from a shaped one."""
     if request.policy == "shaped":
-        names = ("solver", "minimise", "mean_at_most_ns", "least_gain", "seed")
-        values = _of(request, *_LIMITS, *names)
-        most = profile.latencies_ns
-        return with_bands(plan, profile.measured, request.bands, most_ns=most, **values)
+        return with_bands(
+            plan,
+            profile.measured,
+            request.bands,
+            most_ns=profile.latencies_ns,
+            solver=request.solver,
+            minimise=request.minimise,
+            mean_at_most_ns=request.mean_at_most_ns,
+            least_gain=request.least_gain,
+            seed=request.seed,
+            grid_ns=request.grid_ns,
+            max_gap_ns=request.max_gap_ns,
+            max_share=request.max_share,
+        )
     if request.policy == "one-long-slot":
         if request.slot_start_ns is None:
             raise InputError("one long slot needs its start: add --slot-start, such as 62ms")
         return with_long_slot(plan, profile.latencies_ns, request.slot_start_ns)
-    if request.policy in ("server-per-chain", "let-per-chain"):
-        unshaped = request.policy in UNSHAPED
-        return (shaping.server_per_chain if unshaped else shaping.let_per_chain)(plan)
+    if request.policy == "server-per-chain":
+        return shaping.server_per_chain(plan)
+    if request.policy == "let-per-chain":
+        return shaping.let_per_chain(plan)
     if not profile.callbacks or not profile.topics:
         reason = f"the policy {request.policy} needs the chain's callbacks"
         raise InputError(f"{reason}: plan from a recording")
     if request.policy == "pipelined":
-        with_branches = bool(profile.graph_steps_ns.size)
-        steps = profile.graph_steps_ns if with_branches else profile.steps_ns
-        if profile.all_disturbed:
-            every = profile.every_graph_step_ns if with_branches else profile.every_step_ns
-            steps = every[_work(profile, every).finished_ns[:, -1] <= profile.longest_ns]
-        work, cores = _work(profile, steps), request.cores
-        one, room_ns = profile.reception, profile.others_ns
-        if one is not None and one.core in (None, *(cores or profile.core_of.values())):
-            room_ns += one.time_ns + one.beside_ns
-        return pipelined(plan, work, profile.core_of, cores, room_ns=room_ns)
-    if request.policy == "server-per-callback":
+        plan = _pipelined(plan, profile, request.cores)
+    elif request.policy == "server-per-callback":
         margin_ns = plan.margin.epsilon_ns
-        return shaping.server_per_callback(plan, profile.callbacks, margin_ns=margin_ns)
-    return shaping.let_per_callback(plan, profile.topics, profile.nodes)
+        plan = shaping.server_per_callback(plan, profile.callbacks, margin_ns=margin_ns)
+    else:
+        plan = shaping.let_per_callback(plan, profile.topics, profile.nodes)
+    return plan
+
+
+def _pipelined(plan: ChainPlan, profile: Profile, cores: Sequence[int] | None) -> ChainPlan:
+    with_branches = bool(profile.graph_steps_ns.size)
+    steps = profile.graph_steps_ns if with_branches else profile.steps_ns
+    if profile.all_disturbed:
+        every = profile.every_graph_step_ns if with_branches else profile.every_step_ns
+        steps = every[_work(profile, every).finished_ns[:, -1] <= profile.longest_ns]
+    reception, room_ns = profile.reception, profile.others_ns
+    if reception is not None and reception.core in (None, *(cores or profile.core_of.values())):
+        room_ns += reception.time_ns + reception.beside_ns
+    return pipelined(plan, _work(profile, steps), profile.core_of, cores, room_ns=room_ns)
 
 
 def refuse_contradictions(request: PlanRequest, *, sinks: bool, modes: bool) -> None:
-    """Refuse wishes that nothing fulfils, with further ``sinks``, and ``modes`` measured or not."""
+    """Refuse wishes that exclude each other.
+
+    ``sinks``: whether further outputs are planned. ``modes``: whether each mode was measured.
+    """
     if request.bands_of_modes == "found" and not (modes and request.policy == "shaped"):
         reason = "nothing says which mode was in force while latencies were measured"
         raise InputError(f"{reason}: add --mode-profile MODE=REC, or say what `announces` them")
-    if request.epsilon_ns is not None and request.overrun_probability is not None:
-        raise InputError("the margin is either given or covers a share: leave out one of both")
-    if (share := request.overrun_probability) is not None and not 0 < share < 1:
-        raise InputError(f"an overrun probability of {share}: write one between 0 and 1")
+    margins.refuse_contradictory_margin(request)
     if request.policy != "one-long-slot" and request.slot_start_ns is not None:
         raise InputError("a slot's start goes with the policy one-long-slot: add it")
     cores = request.cores or ()
@@ -594,6 +610,7 @@ def refuse_contradictions(request: PlanRequest, *, sinks: bool, modes: bool) -> 
 
 
 def _refuse_placement(request: PlanRequest, why: str) -> None:
+    """Refuse the wishes for the placement of bands, where bands are not placed by them."""
     for name in ("bands", "solver", "max_gap_ns", "max_share", "minimise", "mean_at_most_ns"):
         if getattr(request, name) != getattr(_STANDARD, name):
             option = name.removesuffix("_ns").replace("_", "-")
@@ -601,15 +618,15 @@ def _refuse_placement(request: PlanRequest, why: str) -> None:
 
 
 def refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: bool = False) -> None:
-    """Refuse chains of which one waits for what another's plan delays, or with one output.
+    """Refuse chains that share an output, or of which one waits for what another's plan delays.
 
-    With ``sinks`` all are planned as one: the first chain, and further outputs of its graph.
+    With ``sinks`` all are planned as one chain: the first, and further outputs of its graph.
     """
-    for one, two in combinations(profiles, 2):
-        if one.topics and (one.begins, one.topics) == (two.begins, two.topics):
-            raise InputError(f"the chain {two.name} is given twice: name it once")
-        outputs = [profile.topics[-1] if profile.topics else None for profile in (one, two)]
-        refuse_common((one.name, two.name), (outputs[0], outputs[1]))
+    for first, second in combinations(profiles, 2):
+        if first.topics and (first.begins, first.topics) == (second.begins, second.topics):
+            raise InputError(f"the chain {second.name} is given twice: name it once")
+        outputs = [profile.topics[-1] if profile.topics else None for profile in (first, second)]
+        refuse_common((first.name, second.name), (outputs[0], outputs[1]))
     for shaped, waiting in permutations(profiles, 2):
         # The topics that come later under the plan than they were measured:
         delayed = shaped.topics if policy == "let-per-callback" else shaped.topics[-1:]
@@ -618,39 +635,40 @@ def refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: bool
             reason = f"{waiting.name} waits for {', '.join(on_the_way)}, which the plan for"
             reason += f" {shaped.name} publishes later than it was measured"
             raise InputError(f"{reason}: plan one of the two alone")
-    for one, two in combinations(profiles, 2):
-        if sinks and one.period_ns != two.period_ns:
-            reason = f"{two.name} has the period {duration_text(two.period_ns)}, {one.name}"
-            raise InputError(f"{reason} {duration_text(one.period_ns)}: plan one of the two alone")
-        if one.begins is None or two.begins is None or one.begins == two.begins:
+    for first, second in combinations(profiles, 2):
+        if sinks and first.period_ns != second.period_ns:
+            reason = f"{second.name} has the period {duration_text(second.period_ns)},"
+            reason += f" {first.name} {duration_text(first.period_ns)}"
+            raise InputError(f"{reason}: plan one of the two alone")
+        if first.begins is None or second.begins is None or first.begins == second.begins:
             continue
-        begin = (
-            f"{two.name} begins at {two.begins[1]}, {one.name} at another callback, {one.begins[1]}"
-        )
+        begin = f"{second.name} begins at {second.begins[1]}, {first.name} at another callback,"
+        begin += f" {first.begins[1]}"
         if sinks:
             reason = f"{begin}, and slots of a sink count from the beginning of the chain"
             raise InputError(f"{reason}: name one behind the same callback, or plan one alone")
-        if common := sorted(_waited_for(one, two) | _waited_for(two, one)):
+        if common := sorted(_waited_for(first, second) | _waited_for(second, first)):
             reason = f"{begin}, and both need {', '.join(common)}: neither's cycles can start"
             reason += " without the other's. Begin both where all of it comes from, or plan one of"
             raise InputError(f"{reason} the two alone")
 
 
 def refuse_simulated(profiles: Sequence[Profile], request: PlanRequest) -> None:
-    """Refuse to count slots from stamps that are not of the clock of gates and servers."""
-    for one in profiles:
-        if one.simulated and request.anchor == "stamp" and request.policy not in UNSHAPED:
-            raise InputError(simulated_stamps(one.simulated[0]))
+    """Refuse to count slots from stamps of simulated time, which gates and servers do not have."""
+    for profile in profiles:
+        if profile.simulated and request.anchor == "stamp" and request.policy not in UNSHAPED:
+            raise InputError(simulated_stamps(profile.simulated[0]))
 
 
 def simulated_stamps(node: str) -> str:
-    """Why no slot counts from the stamps of a node that follows `/clock`, and what to do."""
+    """Say why no slot counts from the stamps of a node that follows `/clock`, and what to do."""
     return (
         f"{node} follows /clock (use_sim_time): its stamps are of simulated time. Start it with"
         " use_sim_time:=false; or, where /clock is as fast as time, plan with --anchor cycle"
     )
 
 
-def _waited_for(one: Profile, two: Profile) -> frozenset[str]:
-    """Topics that a chain waits for and are not on its way, which another has or waits for too."""
-    return (one.upstream - set(one.topics)) & (two.upstream | set(two.topics))
+def _waited_for(waiting: Profile, other_chain: Profile) -> frozenset[str]:
+    """Return topics beside a chain that it waits for, and that another has or waits for too."""
+    beside = waiting.upstream - set(waiting.topics)
+    return beside & (other_chain.upstream | set(other_chain.topics))

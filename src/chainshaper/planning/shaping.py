@@ -1,9 +1,9 @@
 """From measured latencies to servers and slots: shaping, and the schedules it is compared with.
 
 **Shaping** (sections 3.1 and 3.2): the chain runs in a server that is open from the start of a
-cycle until every execution seen so far was complete, and its output is published in a server whose
-slot comes then. :func:`plan_shaping` plans one chain; further functions take its plan and return
-one that covers more of a graph (5.1 and 5.4), or of another policy (2.5, 5.1 and 5.3).
+cycle until every execution seen so far was complete. Its output is published in a server whose slot
+begins then. :func:`plan_shaping` plans one chain. Further functions take its plan and return one
+that covers more of a graph (5.1 and 5.4), or follows another policy (2.5, 5.1 and 5.3).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,19 +26,21 @@ from chainshaper.planning.chain_plan import (
     Slot,
     Thread,
 )
-from chainshaper.planning.margins import check_latencies, least_epsilon_ns
+from chainshaper.planning.latencies import check_latencies
+from chainshaper.planning.margins import given_or_least_epsilon_ns
 from chainshaper.planning.overruns import united
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import EqualPriorities, Wishes
 from chainshaper.values.yaml_file import wrong_values_refused
 
-OUTPUT_PRIORITY = 1  # better than the chain's: a publish slot inside its slot has to pre-empt it
+OUTPUT_PRIORITY = 1  # better than the chain's: the output pre-empts a chain in whose slot it leaves
 CHAIN_PRIORITY = 2
-BOUNDARY_NS = 1_000_000  # slots of callbacks are whole multiples of it
+BOUNDARY_NS = 1_000_000  # slots of callbacks begin and end at multiples of it
 PAUSE_NS = 2_000_000  # a receiver on a slow machine takes a millisecond to get to its callback
 _WISHES = {field.name for field in fields(Wishes)}
-_OF_PLAN = ("anchor", "into_open_slot", "messages", "fallback", "shaping_thread")  # of these
+# The wishes that are fields of a plan as well.
+_OF_PLAN = ("anchor", "into_open_slot", "messages", "fallback", "shaping_thread")
 _NO_NODES: dict[str, object] = {"shaping_node": None, "further_shaping_nodes": ()}
 
 
@@ -63,23 +65,26 @@ def plan_shaping(
     same cycle (eq. 3) and on the same core, at the better priority.
 
     ε is the margin's or, without one, 1 ms (0.8 ms with a gate in the publisher's process), Δ is
-    1 ms unless the wishes say otherwise. ``nodes`` are those whose executors run the chain,
-    ``fifo_priority`` and ``receivers`` for the shaping node.
-    ``values`` are fields of :class:`~chainshaper.planning.chain_plan.ChainOfPlan` and
+    1 ms unless the wishes say otherwise. The executors of ``nodes`` run the chain;
+    ``fifo_priority`` and ``receivers`` are those of the shaping node. ``values`` are fields of
+    :class:`~chainshaper.planning.chain_plan.ChainOfPlan` and
     :class:`~chainshaper.planning.chain_plan.Evidence`, and single
-    :class:`~chainshaper.values.plan_choices.Wishes`. OperationError: L̄ + ε + Δ does not fit.
+    :class:`~chainshaper.values.plan_choices.Wishes`.
+
+    Raises OperationError: L̄ + ε + Δ does not fit into the period.
     """
     latencies = check_latencies(latencies_ns)
-    of_chain = {n: values.pop(n) for n in plans.ChainOfPlan.model_fields.keys() & values.keys()}
-    wishes = replace(wishes or Wishes(), **{n: values.pop(n) for n in _WISHES & values.keys()})
+    of_chain = {
+        name: values.pop(name) for name in plans.ChainOfPlan.model_fields.keys() & values.keys()
+    }
+    single = {name: values.pop(name) for name in _WISHES & values.keys()}
+    wishes = replace(wishes or Wishes(), **single)
     length = plans.SHORTEST_SLOT_NS if wishes.publish_slot_ns is None else wishes.publish_slot_ns
     longest = int(latencies.max())
-    least = least_epsilon_ns(wishes.publication)
-    given = least if wishes.epsilon_ns is None else wishes.epsilon_ns
-    epsilon = given if margin is None else margin.epsilon_ns
+    epsilon = given_or_least_epsilon_ns(wishes) if margin is None else margin.epsilon_ns
     if epsilon < 0 or length <= 0 or period_ns <= 0:
-        found = ", ".join(map(duration_text, (epsilon, length, period_ns)))
-        raise InputError(f"epsilon must be 0 ms or more, slot and period longer than 0 ms: {found}")
+        given = ", ".join(map(duration_text, (epsilon, length, period_ns)))
+        raise InputError(f"epsilon must be 0 ms or more, slot and period longer than 0 ms: {given}")
     start = longest + epsilon
     if (end := start + length) > period_ns:
         alone = values.get("interference_ns") is None
@@ -104,13 +109,13 @@ def plan_shaping(
 def server_for(
     nodes: Iterable[str], name: str, core: int, priority: int, slots: Sequence[Slot]
 ) -> Server:
-    """A server that runs the executors of these nodes."""
+    """Return a server that runs the executors of these nodes."""
     threads = tuple(Thread(node=node) for node in nodes)
     return Server(name=name, core=core, priority=priority, slots=tuple(slots), threads=threads)
 
 
 def _publishing(thread: Thread | None, core: int, slot: Slot, name: str | None = None) -> Server:
-    """The server in whose slot a thread publishes; with bare latencies it is not known."""
+    """Return the server in whose slot a thread publishes; with bare latencies that is not known."""
     name = name or f"output_{thread.node.strip('/') if thread else ''}"
     threads = (thread,) if thread else ()
     return Server(name=name, core=core, priority=OUTPUT_PRIORITY, slots=(slot,), threads=threads)
@@ -123,7 +128,7 @@ def _gate(
     fifo_priority: int,
     receivers: Sequence[str],
 ) -> tuple[ShapingNode | None, Thread | None]:
-    """The shaping node of a chain's output, if any, and the thread that publishes it."""
+    """Return the shaping node of a chain's output, if any, and the thread that publishes it."""
     if wishes.publication == "asynchronous" and chain.publisher is not None:
         return None, Thread(node=chain.publisher, role="publisher")
     if chain.output is None:
@@ -146,7 +151,10 @@ def _gate(
 
 
 def _names(output: str) -> dict[str, str]:
-    """The chain publishes on a topic of its own, and the shaping node takes over the output's."""
+    """Return the names of a shaping node and of its topics.
+
+    The chain publishes on a new topic, and the shaping node on the output's.
+    """
     name = "chainshaper" + output.replace("/", "_")
     return {"name": name, "input": f"{output}_tmp", "output": output}
 
@@ -154,45 +162,53 @@ def _names(output: str) -> dict[str, str]:
 def _node_like(
     node: ShapingNode, output: str, publisher: str | None, receivers: Sequence[str] = ()
 ) -> ShapingNode:
-    """A shaping node for another topic, with the core, priority and waiting of a given one."""
-    delivery_ns = node.delivery_ns if receivers else None
-    others = {"publisher": publisher, "receivers": tuple(receivers), "delivery_ns": delivery_ns}
-    others["receivers_at"] = None
-    return ShapingNode.model_validate({**node.model_dump(), **_names(output), **others})
+    """Return a shaping node for another topic, which has core, priority and waiting of ``node``."""
+    of_topic: dict[str, object] = {
+        "publisher": publisher,
+        "receivers": tuple(receivers),
+        "receivers_at": None,
+        "delivery_ns": node.delivery_ns if receivers else None,
+    }
+    return ShapingNode.model_validate({**node.model_dump(), **_names(output), **of_topic})
 
 
 def _inside(node: ShapingNode) -> ShapingNode:
-    """The same for a topic inside the chain: how exactly it leaves is of no consequence there, so
-    it neither watches the clock nor keeps the gate of an output from its core.
+    """Return the same shaping node for a topic inside the chain, where nothing has to be exact.
+
+    It neither watches the clock nor keeps the shaping node of an output from its core.
     """
     behind = max(1, node.fifo_priority - 1)
     return node.model_copy(update={"spin_ns": 0, "fifo_priority": behind})
 
 
 def with_gates_level(chains: Sequence[ChainPlan]) -> tuple[ChainPlan, ...]:
-    """The plans of several chains whose shaping nodes run above the executors of all: those of
-    outputs at one priority, so that the one that wakes first publishes first.
+    """Return plans of several chains whose shaping nodes run above the executors of all chains.
+
+    Those of outputs have one priority, so that the node that wakes up first publishes first.
     """
-    every = [node.fifo_priority for plan in chains for node in plans.shaping_nodes(plan)]
-    return tuple(_with_gates_at(plan, max(every, default=0)) for plan in chains)
+    priorities = [node.fifo_priority for plan in chains for node in plans.shaping_nodes(plan)]
+    return tuple(_with_gates_at(plan, max(priorities, default=0)) for plan in chains)
 
 
 def _with_gates_at(plan: ChainPlan, priority: int) -> ChainPlan:
     node = plan.shaping_node
     if node is None or node.fifo_priority == priority:
         return plan
-    level = node.model_copy(update={"fifo_priority": priority})
-    further = [
-        one.model_copy(update={"fifo_priority": priority}) for one in plan.further_shaping_nodes
-    ]
+    change = {"fifo_priority": priority}
+    further = [inner.model_copy(update=change) for inner in plan.further_shaping_nodes]
     if plans.inner_gates(plan):
-        further = [_inside(one) for one in further]
-    return plans.revised(plan, shaping_node=level, further_shaping_nodes=tuple(further))
+        further = [_inside(inner) for inner in further]
+    return plans.revised(
+        plan,
+        shaping_node=node.model_copy(update=change),
+        further_shaping_nodes=tuple(further),
+    )
 
 
 def evidence_of(latencies_ns: NDArray[np.int64], **conditions: Any) -> Evidence:
-    """The latencies' statistics, with the conditions they were taken under: Evidence's fields.
-    Others may delay a cycle, but need not: the shortest is without that.
+    """Return the statistics of latencies; ``conditions`` are further fields of the evidence.
+
+    Other chains may delay a cycle, but need not: the shortest latency is without that delay.
     """
     return Evidence(
         samples=int(latencies_ns.size),
@@ -204,7 +220,10 @@ def evidence_of(latencies_ns: NDArray[np.int64], **conditions: Any) -> Evidence:
 
 
 def _too_long(longest: int, epsilon: int, publish_slot: int, period: int, *, alone: bool) -> str:
-    """What would make the chain fit: unless it is ``alone``, others may not fit then."""
+    """Say that a chain does not fit into its cycle, and what helps.
+
+    Beside other chains (not ``alone``) a smaller margin may leave these no room, so it is no help.
+    """
     missing = longest + epsilon + publish_slot - period
     remedies = ["a longer period", "a shorter chain"]
     if alone and longest + epsilon < period:
@@ -223,10 +242,10 @@ def _too_long(longest: int, epsilon: int, publish_slot: int, period: int, *, alo
 
 @wrong_values_refused(ChainPlan)
 def over_cores(plan: ChainPlan, core_of: Mapping[str, int]) -> ChainPlan:
-    """One server per core for the chain's threads, each with the chain's slot (section 5.4).
+    """Return the plan with a server on each core for the chain's threads (section 5.4).
 
-    ``core_of`` names the core of every node that takes part, also on branches that the chain waits
-    for, the most urgent first. Raises InputError: a node is missing.
+    Each has the chain's slot. ``core_of`` is the core of each node that takes part, also on
+    branches that the chain waits for, the most urgent first. Raises InputError: a node is missing.
     """
     chain, others = _chain_and_others(plan)
     if missing := [thread.node for thread in chain.threads if thread.node not in core_of]:
@@ -234,7 +253,7 @@ def over_cores(plan: ChainPlan, core_of: Mapping[str, int]) -> ChainPlan:
     split = []
     for core in dict.fromkeys(core_of.values()):
         name = chain.name if len(set(core_of.values())) == 1 else f"{chain.name}_core{core}"
-        nodes = (node for node, its in core_of.items() if its == core)
+        nodes = (node for node, node_core in core_of.items() if node_core == core)
         split.append(server_for(nodes, name, core, chain.priority, chain.slots))
     return plans.revised(plan, servers=(*split, *others))
 
@@ -242,9 +261,11 @@ def over_cores(plan: ChainPlan, core_of: Mapping[str, int]) -> ChainPlan:
 def with_first_node_apart(
     plan: ChainPlan, node: str, slot_end_ns: int, core: int | None = None
 ) -> ChainPlan:
-    """The chain's first node in a server of its own, [0, ``slot_end_ns``), on a ``core`` (default:
-    the chain's), the rest behind it. So a first callback that is no timer starts every execution at
-    the beginning of a cycle (table 4, rows 2 to 5: [0, 2] and [2, 86] ms).
+    """Return the plan with a server [0, ``slot_end_ns``) for the chain's first node alone.
+
+    It is on ``core`` (default: the chain's); the rest of the chain comes behind it. So a first
+    callback that is no timer starts each execution at the beginning of a cycle (table 4, rows 2 to
+    5: [0, 2] and [2, 86] ms).
     """
     chain, others = _chain_and_others(plan)
     (start, end), thread = chain.slots[0], Thread(node=node)
@@ -253,81 +274,106 @@ def with_first_node_apart(
     if not start < slot_end_ns < end:
         limits = f"after {duration_text(start)} and before {duration_text(end)}"
         raise InputError(f"the first node's slot must end {limits}, where the chain's does")
-    own_core, slots = chain.core if core is None else core, [(start, slot_end_ns)]
-    alone = server_for([node], "first", own_core, chain.priority, slots)
-    rest = tuple(other for other in chain.threads if other != thread)
+    first = server_for(
+        [node],
+        "first",
+        chain.core if core is None else core,
+        chain.priority,
+        [(start, slot_end_ns)],
+    )
+    rest = tuple(of_chain for of_chain in chain.threads if of_chain != thread)
     behind = chain.model_copy(update={"slots": ((slot_end_ns, end),), "threads": rest})
-    return plans.revised(plan, servers=(alone, behind, *others))
+    return plans.revised(plan, servers=(first, behind, *others))
 
 
 @wrong_values_refused(ChainPlan)
 def with_best_effort(chains: Sequence[ChainPlan], core_of: Mapping[str, int]) -> list[ChainPlan]:
-    """Plans whose first has a server on each core for these nodes, which are in none of the chains:
-    R_m' of section 3.1, R_int of section 5.1. Raises InputError: a node is in a server already.
+    """Return plans of chains, the first with servers for nodes that are in none of the chains.
+
+    There is such a server on each core (R_m' of section 3.1, R_int of section 5.1). ``core_of`` is
+    the core of each of these nodes. Raises InputError: one is in a server already.
     """
     first, *others = chains
-    known = {
-        one.node: server.name for p in chains for server in p.servers for one in server.threads
+    server_of = {
+        thread.node: server.name
+        for plan in chains
+        for server in plan.servers
+        for thread in server.threads
     }
-    for node in sorted(known.keys() & core_of.keys()):
-        reason = f"{node} is in the server {known[node]!r}"
+    for node in sorted(server_of.keys() & core_of.keys()):
+        reason = f"{node} is in the server {server_of[node]!r}"
         raise InputError(f"{reason}: best effort are nodes beside chains")
     worst = max(server.priority for plan in chains for server in plan.servers)
-    # Threads of publishers come behind their executors where overruns may finish.
-    worst += any(any(plans.publisher_servers(plan)) for plan in chains)
+    # Where overruns may finish, threads of publishers get a priority behind their executors.
+    if any(any(plans.publisher_servers(plan)) for plan in chains):
+        worst += 1
     added = []
     for core in sorted(set(core_of.values())):
-        nodes = (node for node, its in core_of.items() if its == core)
-        own = server_for(nodes, f"best_effort_core{core}", core, worst + 1, [(0, first.cycle_ns)])
-        added.append(own.model_copy(update={"best_effort": True}))
+        nodes = (node for node, node_core in core_of.items() if node_core == core)
+        name, slots = f"best_effort_core{core}", [(0, first.cycle_ns)]
+        server = server_for(nodes, name, core, worst + 1, slots)
+        added.append(server.model_copy(update={"best_effort": True}))
     return [plans.revised(first, servers=(*first.servers, *added)), *others]
 
 
 def with_turns(plan: ChainPlan, equal_priorities: EqualPriorities) -> ChainPlan:
-    """A plan whose servers take turns at one priority (eq. 3), if that is wished."""
+    """Return the plan with servers that take turns at one priority (eq. 3), if that is wished."""
     if equal_priorities == "apart":
         return plan
     best = min(server.priority for server in plan.servers)
-    equal = tuple(one.model_copy(update={"priority": best}) for one in plan.servers)
+    equal = tuple(server.model_copy(update={"priority": best}) for server in plan.servers)
     return plans.revised(plan, servers=plans.below_executors(equal), equal_priorities="round-robin")
 
 
 def _chain_and_others(plan: ChainPlan) -> tuple[Server, list[Server]]:
+    """Return the server of the chain of a plan that was just shaped, and its other servers."""
     for server in plan.servers:
         if server.name == "chain":
-            return server, [other for other in plan.servers if other is not server]
+            return server, [further for further in plan.servers if further is not server]
     raise InputError("the plan has no server named 'chain': begin with a shaped plan")
 
 
 def with_executors(
     plan: ChainPlan, executors: Sequence[Mapping[str, Sequence[tuple[str, ...]]]]
 ) -> ChainPlan:
-    """The plan with those executors of nodes in its servers that run the given callbacks; others of
-    a node whose callback groups have executors of their own run on (section 6).
+    """Return the plan with single executors of nodes that have several (section 6).
+
+    ``executors`` has, for each output, the executors that take part of each such node, by the names
+    of their callbacks. The node's other executors are in no server.
     """
     servers = []
     for server in plan.servers:
         threads: list[Thread] = []
-        for one in server.threads:
-            own = dict.fromkeys(names for known in executors for names in known.get(one.node, ()))
-            apart = own if own and one.role == "executor" else [()]
-            threads += [one.model_copy(update={"callbacks": names}) for names in apart]
+        for thread in server.threads:
+            callbacks = dict.fromkeys(
+                names for of_output in executors for names in of_output.get(thread.node, ())
+            )
+            if not callbacks or thread.role != "executor":
+                callbacks = {(): None}  # all executors of the node
+            threads += [thread.model_copy(update={"callbacks": names}) for names in callbacks]
         servers.append(server.model_copy(update={"threads": tuple(threads)}))
     return plans.revised(plan, servers=tuple(servers))
 
 
-def behind_others(name: str, own: Sequence[Server], taken: Sequence[Server], cycle_ns: int) -> int:
-    """How much later (ns) slots have to be to meet none of those taken on their core. Raises
-    OperationError: then they leave the cycle, and the output of that ``name`` with them.
+def behind_others(
+    name: str, servers: Sequence[Server], taken: Sequence[Server], cycle_ns: int
+) -> int:
+    """Return how much later (ns) slots of servers have to be to meet none taken on their core.
+
+    Raises OperationError: then they leave the cycle, and the output of that ``name`` with them.
     """
-    same_core = (pair for pair in product(own, taken) if pair[0].core == pair[1].core)
-    pairs = [pair for one, other in same_core for pair in product(one.slots, other.slots)]
+    pairs = [
+        slots
+        for server, other_server in product(servers, taken)
+        if server.core == other_server.core
+        for slots in product(server.slots, other_server.slots)
+    ]
     later_ns = min(
         later
         for later in {0, *(max(0, end - start) for (start, _), (_, end) in pairs)}
-        if not any(plans.meet((one[0] + later, one[1] + later), two) for one, two in pairs)
+        if not any(plans.meet((slot[0] + later, slot[1] + later), busy) for slot, busy in pairs)
     )
-    if (end := later_ns + max(one.slots[-1][1] for one in own)) > cycle_ns:
+    if (end := later_ns + max(server.slots[-1][1] for server in servers)) > cycle_ns:
         reason = f"until {duration_text(end)}, after the cycle of {duration_text(cycle_ns)}"
         remedy = "use a shorter slot, or another core for an output"
         raise OperationError(f"{name} would be published {reason}: {remedy}")
@@ -343,12 +389,13 @@ def with_sink(
     publisher: str | None = None,
     receivers: Sequence[str] = (),
 ) -> ChainPlan:
-    """A shaped plan with one more shaped output: another sink of the same graph (end of 5.4).
+    """Return a shaped plan with a further shaped output: another sink of the graph (end of 5.4).
 
-    The sink gets a shaping node; where the plan's output is published asynchronously, the thread of
-    its ``publisher`` is gated instead. ``latencies_ns`` are from the start of the graph to this
-    sink. Its slot starts the plan's margin after the longest, or where a publish slot that is in
-    the way on the same core ends; the chain's servers stay open as long as the slowest sink needs.
+    The sink gets a shaping node. Where the plan's output is published asynchronously, the thread of
+    the sink's ``publisher`` is gated instead. ``latencies_ns`` are from the start of the graph to
+    this sink. Its slot starts the plan's margin after the longest, or where a publish slot that is
+    in the way on the same core ends. The chain's servers stay open as long as the slowest sink
+    needs.
 
     Raises InputError: the plan shapes nothing, or this sink already. OperationError: the slot does
     not fit into the cycle.
@@ -356,7 +403,7 @@ def with_sink(
     node, publishing = plan.shaping_node, plans.output_server(plan)
     if publishing is None or not publishing.threads:
         raise InputError("a further sink needs a plan that shapes one output already")
-    if output in {plan.chain.output, *(other.output for other in plan.further_shaping_nodes)}:
+    if output in {plan.chain.output, *(further.output for further in plan.further_shaping_nodes)}:
         raise InputError(f"the plan shapes {output} already: name each sink once")
     if node is None and publisher is None:
         raise InputError(f"a thread is to be gated, but who publishes {output} is not known")
@@ -371,34 +418,38 @@ def with_sink(
     longer = plans.with_slots(
         plan.servers, {server.name: plans.until(server, done) for server in slowest}
     )
-    added = () if node is None else (_node_like(node, output, publisher, receivers),)
-    thread = added[0].thread if added else Thread(node=publisher or "", role="publisher")
+    further = plan.further_shaping_nodes
+    if node is None:
+        thread = Thread(node=publisher or "", role="publisher")
+    else:
+        of_sink = _node_like(node, output, publisher, receivers)
+        thread, further = of_sink.thread, (*further, of_sink)
     server = _publishing(thread, publishing.core, (start, start + length))
-    further = (*plan.further_shaping_nodes, *added)
     servers = plans.below_executors([*longer, server])
     return plans.revised(plan, servers=servers, further_shaping_nodes=further)
 
 
-# What shaping is compared with -----------------------------------------------------------------
+# The schedules that shaping is compared with ----------------------------------------------------
 
 
 @dataclass(frozen=True)
 class CallbackTimes:
-    """Measured response times of one callback; ``after`` are the places, in the sequence that this
-    stands in, of the callbacks whose data it needs. It ``publishes`` this topic of the graph's.
-    """
+    """Measured response times of a callback, one in a sequence of callbacks."""
 
     node: str
     core: int
     min_response_ns: int
     mean_response_ns: int
     max_response_ns: int
-    after: tuple[int, ...] = ()
-    publishes: str | None = None
+    after: tuple[int, ...] = ()  # the places in the sequence of the callbacks whose data it needs
+    publishes: str | None = None  # the topic of the graph
 
 
 def server_per_chain(plan: ChainPlan) -> ChainPlan:
-    """One server for the chain, nothing shaped (section 3.1; table 4 row 2): what was measured."""
+    """Return a plan with one server for the chain, and nothing shaped (section 3.1; table 4 row 2).
+
+    Its prediction is what was measured.
+    """
     publishing, evidence = plans.output_server(plan), plan.evidence
     longest, jitter = evidence.max_latency_ns, evidence.max_latency_ns - evidence.min_latency_ns
     return plans.revised(
@@ -414,11 +465,11 @@ def server_per_chain(plan: ChainPlan) -> ChainPlan:
 def server_per_callback(
     plan: ChainPlan, callbacks: Sequence[CallbackTimes], *, margin_ns: int = 0
 ) -> ChainPlan:
-    """Time-triggered scheduling: each callback runs in a slot of its own (table 4 row 1).
+    """Return a time-triggered plan: each callback runs in a slot of its own (table 4 row 1).
 
-    It starts when the slots of all callbacks that this one waits for have ended, and the slot
-    before it on its core, and lasts for the longest response time plus ``margin_ns``, rounded up to
-    whole milliseconds. Each of ``callbacks`` comes after those it waits for, the chain's last last.
+    The slot starts when those of all callbacks that this one waits for have ended, and the slot
+    before it on its core. It lasts for the longest response time plus ``margin_ns``, rounded up to
+    whole milliseconds. ``callbacks`` come after those they wait for, that of the output last.
 
     Raises InputError: no callbacks, or one that waits for itself or a later one. OperationError:
     the slots do not fit into the cycle.
@@ -436,8 +487,8 @@ def server_per_callback(
         if len(cores) > 1:
             raise InputError(f"{node} runs on one core, not on {sorted(cores)}: correct it")
         pairs = zip(callbacks, slots, strict=True)
-        own = united([slot for callback, slot in pairs if callback.node == node])
-        servers.append(server_for([node], node.strip("/"), cores.pop(), OUTPUT_PRIORITY, own))
+        of_node = united([slot for callback, slot in pairs if callback.node == node])
+        servers.append(server_for([node], node.strip("/"), cores.pop(), OUTPUT_PRIORITY, of_node))
     return plans.revised(
         plan,
         policy="server-per-callback",
@@ -452,6 +503,7 @@ def server_per_callback(
 
 
 def _slots_in_sequence(callbacks: Sequence[CallbackTimes], margin_ns: int) -> list[Slot]:
+    """Return the slot of each callback: behind those it waits for, and those of its core."""
     if not callbacks or margin_ns < 0:
         raise InputError("slots per callback need callbacks, and a margin of 0 ms or more")
     slots: list[Slot] = []
@@ -469,15 +521,16 @@ def _slots_in_sequence(callbacks: Sequence[CallbackTimes], margin_ns: int) -> li
 
 
 def let_per_chain(plan: ChainPlan) -> ChainPlan:
-    """Logical execution time for the chain as one task: its output leaves at the start of the next
-    cycle (section 5.3, table 5).
+    """Return a plan with logical execution time for the chain as one task (section 5.3, table 5).
+
+    Its output leaves at the start of the next cycle.
     """
     publishing, length = _one_slot(plan)
     if plan.evidence.min_latency_ns <= length:
         shortest = f"the shortest latency {duration_text(plan.evidence.min_latency_ns)}"
         raise InputError(f"{shortest} could leave in its own cycle: use a shorter publish slot")
-    ends = {s.name: length if s is publishing else plan.cycle_ns for s in plan.servers}
-    slots = {name: ((0, end),) for name, end in ends.items()}
+    slots = {server.name: ((0, plan.cycle_ns),) for server in plan.servers}
+    slots[publishing.name] = ((0, length),)
     predicted = _after_periods(plan, 1, length)
     servers = plans.with_slots(plan.servers, slots)
     return plans.revised(plan, policy="let-per-chain", servers=servers, predicted=predicted)
@@ -487,11 +540,12 @@ def let_per_chain(plan: ChainPlan) -> ChainPlan:
 def let_per_callback(
     plan: ChainPlan, topics: Sequence[str], publishers: Sequence[str] = ()
 ) -> ChainPlan:
-    """Logical execution time for every callback: each one's output waits for the next cycle.
+    """Return a plan with logical execution time for every callback (section 5.3, table 5).
 
-    ``topics`` are the outputs of the chain's callbacks in order, the chain's own last;
-    ``publishers`` their nodes, where known. Behind each topic a shaping node republishes in the
-    next cycle, or the publishers' threads run then, where the plan gates one (5.3, table 5).
+    The output of each callback waits for the next cycle. ``topics`` are these outputs in order, the
+    chain's own last; ``publishers`` are their nodes, where known. Behind each topic a shaping node
+    republishes in the next cycle; or, where the plan gates the publisher's thread, the threads of
+    all publishers run then.
     """
     publishing, length = _one_slot(plan)
     last = plan.shaping_node
@@ -513,7 +567,8 @@ def let_per_callback(
         inside = tuple(_inside(_node_like(last, topic, publisher)) for topic, publisher in known)
         threads = [node.thread for node in (*inside, last)]
     gates = []
-    # Backwards: whatever a fast callback makes of the data of one slot, that of its output is over.
+    # Backwards, the chain's output first: when a fast callback has used the data of a slot, the
+    # slot of its own output is over in this cycle.
     for number, thread in enumerate(reversed(threads)):
         slot = (number * length, (number + 1) * length)
         gates.append(_publishing(thread, publishing.core, slot, None if number else "output"))
@@ -527,7 +582,7 @@ def let_per_callback(
 
 
 def _one_slot(plan: ChainPlan) -> tuple[Server, int]:
-    """The server of the output, and how long its only slot is."""
+    """Return the server of the output, and how long its only slot is (ns)."""
     publishing, slots = plans.output_server(plan), plans.publish_slots(plan)
     if publishing is None or len(slots) != 1:
         raise InputError(f"LET needs a plan with one publish slot; this one has {len(slots)}")

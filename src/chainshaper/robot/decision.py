@@ -1,6 +1,6 @@
 """The gate's decision for one message: when it may leave, or why it never does.
 
-A change of the mode, or a move of all slots, is in force from the first cycle that begins after it.
+What may change from one cycle to the next is in the gate's schedules (`schedules.py`).
 The same decision in C++ is `core/gate/decision.hpp`.
 """
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias, get_args
 
 from chainshaper.robot.gate import Gate
+from chainshaper.robot.schedules import Schedule, first_schedule, schedule_in_force
 
 Dropped: TypeAlias = Literal["replaced", "overflowed", "discarded"]
 DROPPED = get_args(Dropped)
@@ -52,57 +53,57 @@ def release_of(
     gate: Gate,
     arrival_ns: int,
     stamp_ns: int | None,
-    changes: Sequence[tuple[int, str]] = (),
+    schedules: Sequence[Schedule] = (),
     *,
     ready_ns: int | None = None,
     phase_ns: int | None = None,
-    moves: Sequence[tuple[int, int]] = (),
 ) -> Release:
     """Decide when a message may leave. Times are ns of CLOCK_MONOTONIC.
 
     * ``stamp_ns``: the message's origin; None: it has none.
-    * ``changes``: the modes that were announced, each behind the time of its announcement;
-      ascending.
+    * ``schedules``: what holds from which cycle on; none: what the gate says.
     * ``ready_ns``: the message leaves at this time at the earliest, because others leave before it;
       None: at its arrival.
-    * ``phase_ns``: where cycles start; None: at the gate's ``phase_ns``.
-    * ``moves``: by how much slots are moved from where the gate has them, each behind the time from
-      which on; ascending.
+    * ``phase_ns``: where cycles started when the message came; None: as its schedule has it.
 
         >>> gate = Gate(slots=((60, 61),), cycle_ns=100)
         >>> release_of(gate, arrival_ns=1040, stamp_ns=1000).at_ns      # early: it waits
         1060
         >>> release_of(gate, arrival_ns=1070, stamp_ns=1000).at_ns      # missed: the next cycle
         1160
-        >>> release_of(gate, arrival_ns=1140, stamp_ns=1100, moves=[(1050, 10)]).at_ns
+        >>> moved = [Schedule(0, phase_ns=0), Schedule(1050, phase_ns=0, moved_ns=10)]
+        >>> release_of(gate, 1140, 1100, moved).at_ns
         1170
-        >>> modes = Modes(bands={"city": 1, "highway": 0}, default="city", late="next-slot")
+        >>> modes = GateModes(slots={"city": 1, "highway": 0}, default="city", late="next-slot")
         >>> gate = Gate(slots=((20, 21), (60, 61)), cycle_ns=100, modes=modes)
-        >>> release_of(gate, 1110, 1100, changes=[(1050, "highway")]).at_ns
+        >>> release_of(gate, 1110, 1100, [Schedule(1050, phase_ns=0, mode="highway")]).at_ns
         1120
     """
     cycle_ns, modes, policy = gate.cycle_ns, gate.modes, gate.policy
+    schedules = schedules or (first_schedule(gate),)
     if stamp_ns is not None and gate.counts_from(stamp_ns, arrival_ns):
         origin, anchor, due = stamp_ns, "stamp", gate.due_cycles
     else:
-        elapsed = (arrival_ns - (gate.phase_ns if phase_ns is None else phase_ns)) % cycle_ns
+        if phase_ns is None:
+            phase_ns = schedule_in_force(schedules, arrival_ns).phase_ns
+        elapsed = (arrival_ns - phase_ns) % cycle_ns
         origin, anchor, due = arrival_ns - elapsed, "cycle", min(gate.due_cycles, 1)
     mode, first, slots = None, 0, gate.slots
     if modes is not None:
-        announced = (name for since, name in reversed(changes) if since <= origin)
-        mode = next(announced, modes.default)
-        first = modes.bands[mode]
+        mode = schedule_in_force(schedules, origin).mode or modes.default
+        first = modes.slots[mode]
         slots = slots[first : None if modes.late == "next-slot" else first + 1]
     ready = arrival_ns if ready_ns is None else max(arrival_ns, ready_ns)
     # A stamp slightly from the future puts the arrival before its own cycle: cycle 0 still.
     cycle = max(due, (ready - origin) // cycle_ns)
-    moved = moved_at(moves, due_from := origin + due * cycle_ns)
+    due_from = origin + due * cycle_ns
+    moved = schedule_in_force(schedules, due_from).moved_ns
     if policy != "wait" and not gate.lets_out(slots[-1], due_from + moved, arrival_ns, ready):
         at_once = Release(ready, origin, None, cycle, anchor, policy, mode, moved)
         return at_once if policy == "publish" else at_once.dropping("discarded")
     while True:
         cycle_start = origin + cycle * cycle_ns
-        moved = moved_at(moves, cycle_start)
+        moved = schedule_in_force(schedules, cycle_start).moved_ns
         for number, slot in enumerate(slots, first):
             if gate.lets_out(slot, cycle_start + moved, arrival_ns, ready):
                 at = max(ready, cycle_start + moved + slot[0])
@@ -110,11 +111,6 @@ def release_of(
                 treated = "wait" if cycle > due else later
                 return Release(at, origin, number, cycle, anchor, treated, mode, moved)
         cycle += 1
-
-
-def moved_at(moves: Sequence[tuple[int, int]], cycle_start_ns: int) -> int:
-    """Return by how much the slots of the cycle that starts at this time are moved (ns)."""
-    return next((by for since, by in reversed(moves) if since <= cycle_start_ns), 0)
 
 
 def missed(gate: Gate, release: Release, now_ns: int) -> bool:

@@ -14,8 +14,10 @@ The standby publishes what the node had received and not released when it died, 
 longer than a given patience. The node leaves out what the standby has published. A node that dies
 in the microseconds between a publication and its note on the page has it published twice.
 
-`apply --adapt` reads latencies from a third ring of the page, and writes there by how much slots
-are moved. It has a lock of its own while it does; when that lock is free, however the process
+Other processes change a gate's schedule through the page: a ring has what was asked for, from when
+on, and the gate takes it over with each message (`schedules.py`). `apply` asks for the phase of a
+gate that has no ROS parameters. `apply --adapt` reads latencies from another ring and asks for
+moved slots; it has a lock of its own while it does. When that lock is free, however the process
 ended, the gate uses the planned slots.
 
 Standard library only, as the gate. `handover.hpp`, the node's side in C++, has this layout.
@@ -32,10 +34,12 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
+from typing import NamedTuple
 
 from chainshaper.robot.decision import DROPPED, Release
 from chainshaper.robot.shaper import Shaper
-from chainshaper.robot.waiting import Outcome, Waiting
+from chainshaper.robot.waiting import Outcome, Queue, Waiting
 
 FIELDS = (
     "holder",  # the process id of the shaping node in force; 0 while the standby has the lock
@@ -61,23 +65,24 @@ FIELDS = (
     "lost_by_dds",  # messages that DDS lost before they reached shaping nodes
     "late",  # messages that came behind the last slot that they were due in
     "measured",  # how many latencies, from origin to arrival, are in their ring
-    "moved_ns",  # by how much slots are moved from where the gate has them
-    "moved_from_ns",  # in cycles that start then or later; 0: it is being written, or never was
+    "asked",  # how many changes of the schedule were asked for: so many are in their ring
     "in_process",  # 1: the gate is in the publisher's process, and needs no standby
-    "asked_phase_ns",  # where cycles of that gate are asked to start: it has no ROS parameters
-    "phases_asked",  # how often that was asked so far
     "parent",  # of the shaping node that started last: the process that launched it
 )
 """Numbers of 8 bytes at the beginning of a page, in this order."""
 
-VERSION = 4  # of the page's layout: part of its name
+VERSION = 5  # of the page's layout: part of its name
 RING = 1024
-RELEASED, BYPASSED, MEASURED = 32, 32 + RING, 32 + 2 * RING  # places of three rings
-TOPIC = 32 + 3 * RING  # place of the output's name
+RELEASED, BYPASSED, MEASURED = 32, 32 + RING, 32 + 2 * RING  # places of rings of numbers
+ASKED = 32 + 3 * RING  # place of the ring of changes that were asked for, of three numbers each:
+CHANGES = 64  # the room of that ring
+NEW_PHASE, NEW_MOVE = 0, 1  # what a change may be of
+TOPIC = ASKED + 3 * CHANGES  # place of the output's name
 TOPIC_BYTES = 256
-PUBLISHING, STANDING_BY, PASSING, MOVING = 0, 1, 2, 3
+PUBLISHING, STANDING_BY, PASSING, MOVING, ASKING = 0, 1, 2, 3, 4
 """The bytes of the file that are locked. Each stands for a right: to publish; to be the standby; to
-publish as the standby although the shaping node has the first; to move slots."""
+publish as the standby although the shaping node has the first; to move slots, for as long as it is
+held; to add to the changes that are asked for."""
 _RINGS = {"released": RELEASED, "bypassed": BYPASSED, "measured": MEASURED}
 """The place of each ring, by the name of the field that counts its numbers."""
 _COUNTS = ("starts", "published", *DROPPED, "lost_by_dds", "late")
@@ -139,6 +144,20 @@ def _make_private(folder: str) -> None:
         os.mkdir(folder, 0o700)  # noqa: PTH102
 
 
+class Change(NamedTuple):
+    """A change of a gate's schedule that was asked for.
+
+    * ``from_ns``: it is in force in cycles that start then or later (CLOCK_MONOTONIC).
+    * ``what``: :data:`NEW_PHASE`: where cycles start, or :data:`NEW_MOVE`: by how much slots are
+      moved from where the gate has them.
+    * ``value``: that time (ns).
+    """
+
+    from_ns: int
+    what: int
+    value: int
+
+
 class Page:
     """A page and its locks; numbers are read and written under the names of :data:`FIELDS`.
 
@@ -181,12 +200,15 @@ class Page:
 
     def _read(self, at: int, size: int) -> bytes:
         """Return ``size`` bytes of the page from ``at`` on; zeros for those that are not there."""
+        if self._seen is None:
+            return self._stored(at, size)
+        return self._seen[at : at + size].ljust(size, b"\0")
+
+    def _stored(self, at: int, size: int) -> bytes:
+        """Return bytes as they are now, also to a process that only reads the page."""
         content = b""
-        if self._seen is not None:
-            content = self._seen[at : at + size]
-        else:
-            with suppress(OSError):
-                content = os.pread(self._file, size, at)
+        with suppress(OSError):
+            content = os.pread(self._file, size, at)
         return content.ljust(size, b"\0")
 
     def _numbers(self, place: int, count: int) -> tuple[int, ...]:
@@ -228,6 +250,32 @@ class Page:
         """Return the numbers of a ring behind the first ``since`` that are still there."""
         last, numbers = self[ring], self.noted(ring)
         return [numbers[number % RING] for number in range(max(since, last - RING), last)]
+
+    def ask(self, change: Change) -> None:
+        """Ask the gate for a change of its schedule."""
+        give_up = time.monotonic_ns() + GIVE_UP_NS
+        while not self.lock(ASKING) and time.monotonic_ns() < give_up:
+            time.sleep(0.0001)
+        (number,) = struct.unpack("=q", self._stored(8 * _AT["asked"], 8))  # others ask as well
+        place = ASKED + 3 * (number % CHANGES)
+        with suppress(OSError):
+            os.pwrite(self._file, struct.pack("=3q", *change), 8 * place)
+        self["asked"] = number + 1
+        self.unlock(ASKING)
+
+    def asked(self, since: int = 0) -> list[Change]:
+        """Return the changes behind the first ``since`` that are still there."""
+        last, numbers = self["asked"], self._numbers(ASKED, 3 * CHANGES)
+        places = (3 * (number % CHANGES) for number in range(max(since, last - CHANGES, 0), last))
+        return [Change(*numbers[place : place + 3]) for place in places]
+
+    @property
+    def moved_ns(self) -> int:
+        """By how much another process has the slots moved."""
+        if not self.is_locked(MOVING):
+            return 0
+        moves = [change.value for change in self.asked() if change.what == NEW_MOVE]
+        return moves[-1] if moves else 0
 
     @property
     def topic(self) -> str:
@@ -282,7 +330,8 @@ class Turn:
 
     def __init__(self, name: str, topic: str) -> None:
         self._name, self._topic = name, topic
-        self._gave_up = self._move_back = False
+        self._gave_up = False
+        self._has_moved = False  # slots are where another process has asked for them
         self._open()
         page, now = self.page, time.monotonic_ns()
         if now - page["started_ns"] > AT_ONCE_NS:
@@ -306,6 +355,10 @@ class Turn:
         self.page, self._in_force = page, False
         # How many messages the standby had dealt with at the last look, and which.
         self._seen, self._bypassed, self._oldest = -1, frozenset[int](), 0
+        # How many changes were asked for at the last look. A phase that was asked for before is
+        # that of another gate; a move is in force for as long as its process lives.
+        self._asked = page["asked"]
+        self._moves_before = [change for change in page.asked() if change.what == NEW_MOVE]
 
     @property
     def wait_s(self) -> float:
@@ -319,19 +372,20 @@ class Turn:
     def go_on(self, shaper: Shaper) -> None:
         """Give a gate the phase and the mode of the gate before it in the same launch.
 
-        From now on the page shows each of its decisions, and says how its slots are moved.
+        From now on the page shows each of its decisions, and changes its schedule.
         """
-        modes = [] if shaper.gate.modes is None else [*shaper.gate.modes.bands]
+        modes = [] if shaper.gate.modes is None else [*shaper.gate.modes.slots]
+        queue, cycle_ns = shaper.queue, shaper.gate.cycle_ns
 
-        def decided(release: Release, phase_ns: int) -> None:
+        def decided(release: Release) -> None:
             mode = 0 if release.mode is None else modes.index(release.mode) + 1
-            self.hold(release.at_ns, phase_ns, mode)
+            self.hold(release.at_ns, release.origin_ns % cycle_ns, mode)
 
-        shaper.moved, shaper.on_decision = self.moved, decided
+        shaper.follow, shaper.on_decision = partial(self.follow, queue), decided
         if self.page["phase_known"]:  # from now on, not the next cycle
-            shaper.set_phase(self.page["phase_ns"], time.monotonic_ns() - shaper.gate.cycle_ns)
+            queue.set_phase(self.page["phase_ns"], time.monotonic_ns() - cycle_ns)
         if 0 < (mode := self.page["mode"]) <= len(modes):
-            shaper.switch(modes[mode - 1], 0)
+            queue.switch(modes[mode - 1], 0)
 
     def take(self, key: int | None) -> bool:
         """Return whether this node deals with a message that it received."""
@@ -366,6 +420,14 @@ class Turn:
         self.page["taken"] += 1  # which tells the standby that this node does not hang
         return True
 
+    def is_overtaken_by(self, key: int | None) -> bool:
+        """Return whether the standby has dealt with this message, which is behind the one in hand.
+
+        The one in hand would come after it. The standby, which started later than this node, did
+        not receive the one in hand. To be called after :meth:`was_bypassed`.
+        """
+        return key in self._bypassed
+
     def done(self, key: int | None) -> None:
         """Note that a message has been published or discarded."""
         self.page.add("released", key or 0)
@@ -375,24 +437,31 @@ class Turn:
             left = self.page
             with suppress(OSError):  # where there is no folder, the node stays with this page
                 self._open()
-                self._move_back = left["moved_from_ns"] != 0
                 for key_before in left.noted("released"):  # for a standby that lags behind
                     self.page.add("released", key_before)
                 left.close()
 
-    def moved(self) -> tuple[int, int] | None:
-        """Return the arguments of :meth:`.Shaper.move_slots`; None: slots stay as they are.
+    def follow(self, queue: Queue) -> None:
+        """Take over what was asked for since the last call into the schedules of a gate.
 
-        Slots go back to the planned ones where the process that moved them has ended, or where it
-        moved them on a page that this node has left.
+        Slots go back to the planned ones where the process that had them moved has ended, or where
+        it did so on a page that this node has left. A phase is asked of a gate that runs: a new one
+        does not take it over.
         """
-        if self._move_back:
-            self._move_back = False
-            return 0, time.monotonic_ns()
-        since, by = self.page["moved_from_ns"], self.page["moved_ns"]
-        if since == 0 or since != self.page["moved_from_ns"]:
-            return None
-        return (by, since) if self.page.is_locked(MOVING) else (0, time.monotonic_ns())
+        asked, changes, self._moves_before = self.page["asked"], self._moves_before, []
+        if asked != self._asked:
+            changes += self.page.asked(self._asked)
+            self._asked = asked
+        self._has_moved = self._has_moved or any(change.what == NEW_MOVE for change in changes)
+        is_following = self._has_moved and self.page.is_locked(MOVING)
+        for from_ns, what, value in changes:
+            if what == NEW_PHASE:
+                queue.set_phase(value, from_ns)
+            elif what == NEW_MOVE and is_following:
+                queue.move_slots(value, from_ns)
+        if self._has_moved and not is_following:
+            queue.move_slots(0, time.monotonic_ns())
+            self._has_moved = False
 
     def count(self, outcome: Outcome) -> None:
         """Count a message that has been published or dropped, and its latency to its arrival."""

@@ -36,10 +36,9 @@ class Shaper:
 
     * ``look`` takes what has come and calls :meth:`arrive` for it; while messages wait, before each
       release and behind it.
-    * ``moved`` returns the arguments of :meth:`move_slots`, or None where slots stay as they are;
-      with each message.
+    * ``follow`` puts into the queue's schedules what was asked for meanwhile; with each message.
     * ``on_waking`` gets the time of a release, ``spin_ns`` before it.
-    * ``on_decision`` gets each decision before the wait for it, and where cycles start.
+    * ``on_decision`` gets each decision before the wait for it.
 
     ``overflowed`` are the messages that overflowed since the owner emptied this list.
     """
@@ -49,35 +48,12 @@ class Shaper:
         self.spin_ns = spin_ns
         self.overflowed: list[Outcome] = []
         self.look: Callable[[], None] = lambda: None
-        self.moved: Callable[[], tuple[int, int] | None] = lambda: None
+        self.follow: Callable[[], None] = lambda: None
         self.on_waking: Callable[[int], None] = lambda _: None
-        self.on_decision: Callable[[Release, int], None] = lambda *_: None
+        self.on_decision: Callable[[Release], None] = lambda _: None
         self._looked_ns = self._waited_ns = self._turn_ns = 0
         self._offset = clock_offset()
-        self._next_phase: tuple[int, int] | None = None  # from when on, and the phase (ns)
         self._thread, self._schedstat = 0, -1
-
-    def set_phase(self, phase_ns: int, now_ns: int) -> None:
-        """Start cycles at another phase, from the first such start after ``now_ns`` on."""
-        self._next_phase = (now_ns + (phase_ns - now_ns) % self.gate.cycle_ns, phase_ns)
-
-    def move_slots(self, by_ns: int, from_ns: int) -> None:
-        """Move the slots of cycles that start at ``from_ns`` or later from where the gate has them.
-
-        Nothing changes where they are moved so already, or would leave the cycle.
-        """
-        moves = self.queue.moves
-        if by_ns != (moves[-1][1] if moves else 0) and self.gate.may_move(by_ns):
-            moves.append((from_ns, by_ns))
-
-    def switch(self, mode: str | None, now_ns: int) -> bool:
-        """Put a mode in force from the next cycle on; return False if there is no such mode."""
-        modes, changes = self.gate.modes, self.queue.changes
-        if modes is None or mode is None or mode not in modes.bands:
-            return False
-        if mode != (changes[-1][1] if changes else modes.default):
-            changes.append((now_ns, mode))
-        return True
 
     def arrive(
         self,
@@ -100,12 +76,7 @@ class Shaper:
         stamp, arrival = origin_of(payload), now_ns
         if source_ns is not None and not stepped:
             arrival = min(now_ns, max(self._looked_ns, source_ns - offset))
-        if self._next_phase is not None and arrival >= self._next_phase[0]:
-            self.queue.phase_ns = self._next_phase[1]
-            self._next_phase = None
-        if (move := self.moved()) is not None:
-            by_ns, from_ns = move
-            self.move_slots(by_ns, from_ns)
+        self.follow()
         stamp = None if stamp is None else stamp - offset
         overflowed = self.queue.arrive(payload, arrival, stamp, about, lost)
         if overflowed is not None:
@@ -121,7 +92,7 @@ class Shaper:
         message, now = queue.waiting[0], time.monotonic_ns()
         self._turn_ns = now  # before, this thread was busy with the message before it
         release = queue.decide()
-        self.on_decision(release, queue.phase_ns)
+        self.on_decision(release)
         if release.at_ns is not None:
             self._waited_ns = self._others_ran_ns()
             slept = release.at_ns > now
@@ -129,7 +100,8 @@ class Shaper:
                 sleep_until(min(awake, now + LOOK_NS))
                 self._look()
                 now = time.monotonic_ns()
-            if not slept and self.gate.messages == "newest":
+            # The first time, it may have come long ago, and newer ones since.
+            if not slept and (self.gate.messages == "newest" or not self._looked_ns):
                 self._look()
             if queue.waiting[0] is not message:
                 return None

@@ -8,10 +8,15 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
-from chainshaper.robot.decision import Release, moved_at, release_of
+from chainshaper.robot.decision import Release, release_of
 from chainshaper.robot.gate import Gate
-
-CHANGES = 64  # modes, or moves, that are remembered: they reach back behind the oldest stamp
+from chainshaper.robot.schedules import (
+    Schedules,
+    first_schedule,
+    schedule_in_force,
+    with_change,
+    with_phase_seen,
+)
 
 
 @dataclass(eq=False)
@@ -49,25 +54,46 @@ class Outcome:
 class Queue:
     """The messages that wait at a gate, and which of them leave. It reads no clock.
 
-    * ``phase_ns``: where cycles start, for messages whose stamp is of no use.
+    * ``schedules``: what holds from which cycle on.
     * ``waiting``: the messages, the oldest first.
-    * ``changes``, ``moves``: see :func:`.release_of`.
     * ``free_ns``: when the gate's thread was done with the message before; the oldest one leaves
       after that.
     """
 
     def __init__(self, gate: Gate) -> None:
         self.gate = gate
-        self.phase_ns = gate.phase_ns
+        self.schedules: Schedules = (first_schedule(gate),)
         self.waiting: deque[Waiting] = deque()
-        self.changes: deque[tuple[int, str]] = deque(maxlen=CHANGES)
-        self.moves: deque[tuple[int, int]] = deque(maxlen=CHANGES)
         self.free_ns = 0
         # The start of the cycle that the oldest message leaves in, or a newer one in its place.
         self._leaving: int | None = None
         # The start of the cycle in which the last message left.
         self._left: int | None = None
         self._unsure_until_ns = 0
+
+    def set_phase(self, phase_ns: int, from_ns: int) -> None:
+        """Start cycles at another phase, from the first such start at ``from_ns`` or later on."""
+        cycle_ns = self.gate.cycle_ns
+        start_ns = from_ns + (phase_ns - from_ns) % cycle_ns
+        self.schedules = with_change(self.schedules, start_ns, phase_ns=phase_ns % cycle_ns)
+
+    def move_slots(self, by_ns: int, from_ns: int) -> None:
+        """Move the slots of cycles that start at ``from_ns`` or later from where the gate has them.
+
+        Nothing changes where they would leave the cycle.
+        """
+        if self.gate.may_move(by_ns):
+            self.schedules = with_change(self.schedules, from_ns, moved_ns=by_ns)
+
+    def switch(self, mode: str | None, from_ns: int) -> bool:
+        """Put a mode in force in cycles that start at ``from_ns`` or later.
+
+        Returns False if there is no such mode.
+        """
+        if self.gate.modes is None or mode is None or mode not in self.gate.modes.slots:
+            return False
+        self.schedules = with_change(self.schedules, from_ns, mode=mode)
+        return True
 
     def doubt_stamps(self, now_ns: int) -> None:
         """Use no stamps until all messages that are under way now have come.
@@ -86,10 +112,11 @@ class Queue:
     ) -> Outcome | None:
         """Queue a message; return the one that overflowed, or None."""
         stamp_ns = None if arrival_ns < self._unsure_until_ns else stamp_ns
-        message = Waiting(payload, arrival_ns, stamp_ns, self.phase_ns, about, lost)
-        self.waiting.append(message)
         if stamp_ns is not None and self.gate.counts_from(stamp_ns, arrival_ns):
-            self.phase_ns = stamp_ns % self.gate.cycle_ns
+            seen_ns = stamp_ns % self.gate.cycle_ns
+            self.schedules = with_phase_seen(self.schedules, seen_ns, arrival_ns)
+        phase_ns = schedule_in_force(self.schedules, arrival_ns).phase_ns
+        self.waiting.append(Waiting(payload, arrival_ns, stamp_ns, phase_ns, about, lost))
         if len(self.waiting) <= self.gate.depth:
             return None
         oldest = self.waiting.popleft()
@@ -103,7 +130,8 @@ class Queue:
         if release.slot is None or self.gate.messages == "all-in-order":
             return release
         if self._left is not None and self._same_cycle(release, self._left):
-            last_end = self._left + moved_at(self.moves, self._left) + self.gate.slots[-1][1]
+            moved_ns = schedule_in_force(self.schedules, self._left).moved_ns
+            last_end = self._left + moved_ns + self.gate.slots[-1][1]
             release = self._release(oldest, max(ready, last_end))
             if release.slot is None:
                 return release if release.at_ns is None else replace(release, at_ns=ready)
@@ -133,10 +161,9 @@ class Queue:
             self.gate,
             message.arrival_ns,
             message.stamp_ns,
-            self.changes,
+            self.schedules,
             ready_ns=ready_ns,
             phase_ns=message.phase_ns,
-            moves=self.moves,
         )
 
     def _same_cycle(self, release: Release, start_ns: int | None) -> bool:

@@ -19,10 +19,13 @@ from chainshaper.linux.threads import innermost_id, parents, read_proc, status_f
 from chainshaper.robot.decision import DROPPED
 from chainshaper.robot.handover import (
     MOVING,
+    NEW_MOVE,
+    NEW_PHASE,
     PASSING,
     PUBLISHING,
     STANDING_BY,
     VERSION,
+    Change,
     Page,
     page_folders,
 )
@@ -195,8 +198,7 @@ def ask_phase(topic: str, pids: Collection[int], phase_ns: int) -> None:
     Raises OperationError: none of these processes publishes the output, or several do.
     """
     with closing(_page_of(topic, pids)) as page:
-        page["asked_phase_ns"] = phase_ns
-        page["phases_asked"] += 1
+        page.ask(Change(time.monotonic_ns(), NEW_PHASE, phase_ns))
 
 
 def _page_of(topic: str, pids: Collection[int]) -> Page:
@@ -229,15 +231,13 @@ class FollowedOutput:
 
     def __init__(self, topic: str, pids: Collection[int] = ()) -> None:
         self._page = _page_of(topic, pids)
-        if not self._page.is_locked(MOVING):  # a run before moved the slots, and has ended
-            self._page["moved_from_ns"] = 0
         if not self._page.lock(MOVING):
             self._page.close()
             raise OperationError(
                 f"another run has the slots of {topic} follow its latencies: end that first"
             )
         self._seen = self._page["measured"]
-        self.move(0, time.monotonic_ns())
+        self.move(0, time.monotonic_ns())  # a run before may have moved them, and has ended
 
     def latencies(self) -> list[int]:
         """Return the latencies of outputs since the last call, from origin to arrival (ns).
@@ -256,9 +256,7 @@ class FollowedOutput:
 
     def move(self, by_ns: int, from_ns: int) -> None:
         """Move slots by this time from where the gate has them, in cycles from an instant on."""
-        self._page["moved_from_ns"] = 0
-        self._page["moved_ns"] = by_ns
-        self._page["moved_from_ns"] = from_ns
+        self._page.ask(Change(from_ns, NEW_MOVE, by_ns))
 
     def close(self) -> None:
         """Let the slots go back to where the gate has them."""
@@ -304,7 +302,7 @@ def _looked_at(page: Page, pid_of: Mapping[int, int]) -> list[ShapedOutput]:
             published=page["published"],
             lost={why: count for why, count in counts.items() if count},
             late=page["late"],
-            moved_ns=page["moved_ns"] if page["moved_from_ns"] and page.is_locked(MOVING) else 0,
+            moved_ns=page.moved_ns,
             page=page.path,
             user=page.owner,
         )

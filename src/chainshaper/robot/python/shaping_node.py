@@ -12,6 +12,7 @@ import socket
 import sys
 import time
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import rclpy
@@ -105,7 +106,7 @@ def listen_to_modes(node: Node, shaper: Shaper, topic: str) -> None:
             qos.durability = QoSDurabilityPolicy.TRANSIENT_LOCAL
 
     def announced(message: Any) -> None:
-        if shaper.switch(message.data, time.monotonic_ns()):
+        if shaper.queue.switch(message.data, time.monotonic_ns()):
             logger.info(f"mode {message.data}")
         else:
             logger.warning(f"there is no mode {message.data!r}")
@@ -167,7 +168,7 @@ class Shaping:
         """``phase_ns`` may be set while the node runs, in force from the next cycle on."""
         for one in parameters:
             if one.name == "phase_ns":
-                self._shaper.set_phase(one.value, time.monotonic_ns())
+                self._shaper.queue.set_phase(one.value, time.monotonic_ns())
         return SetParametersResult(successful=True)
 
     def _await_receivers(self, node: Node, publisher: Any) -> None:
@@ -219,9 +220,11 @@ class Shaping:
         outcome = self._shaper.hold()
         if outcome is None:
             return
-        if turn is not None and turn.was_bypassed(key):
-            self._readiness.ask_for()
-            return
+        if turn is not None:
+            if turn.was_bypassed(key):
+                self._readiness.ask_for()
+                return
+            outcome = self._in_order(outcome, turn)
         published = stalled = None
         if outcome.release.at_ns is not None:
             try:
@@ -240,6 +243,12 @@ class Shaping:
         self._note(outcome, published, stalled)
         if not self._shaper.queue.waiting:
             gc.collect()  # here is time for it; all that is older is frozen
+
+    def _in_order(self, outcome: Outcome, turn: Turn) -> Outcome:
+        """Drop the message if the standby has published one that waits behind it."""
+        if any(turn.is_overtaken_by(newer.about) for newer in self._shaper.queue.waiting):
+            return replace(outcome, release=outcome.release.dropping("replaced"))
+        return outcome
 
     def _shape_uninformed(self, payload: bytes) -> None:
         self._shape(payload, {})

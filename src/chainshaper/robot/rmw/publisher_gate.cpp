@@ -274,10 +274,6 @@ private:
     std::vector<Message> all;  // the newest first
     for (auto * one = arrived_.exchange(nullptr); one != nullptr; one = one->next)
       all.emplace_back(one);
-    shaper_.follow_moves();
-    // Where cycles begin is found while the application runs.
-    if (const auto phase = turn_ ? turn_->asked_phase_ns() : std::nullopt)
-      shaper_.set_phase(*phase, monotonic_ns());
     for (auto one = all.rbegin(); one != all.rend(); ++one) {
       const auto & [bytes, stamp, next] = **one;
       const auto origin = origin_of(bytes.buffer, bytes.length);

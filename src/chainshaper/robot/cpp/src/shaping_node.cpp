@@ -305,6 +305,11 @@ private:
     auto outcome = shaper_.hold();
     if (!outcome) return;
     if (turn_ && turn_->was_bypassed(key)) return readiness_.ask_for();
+    const auto & newer = shaper_.queue.waiting;
+    if (turn_ && std::any_of(newer.begin(), newer.end(), [this](const auto & waiting) {
+          return turn_->is_overtaken_by(key_of(waiting));
+        }))
+      outcome->release.drop(Dropped::replaced);
     Maybe published_ns, stalled_ns;
     if (outcome->release.at_ns) {
       try {
@@ -340,7 +345,7 @@ private:
     const auto stamp = stamp_of(*message, 0);
     const bool within = info.from_intra_process;  // without anything else of DDS
     if (const std::unique_lock<std::mutex> ours(asking_, std::try_to_lock); ours && asked_phase_) {
-      shaper_.set_phase(asked_phase_->first, asked_phase_->second);
+      shaper_.queue.set_phase(asked_phase_->first, asked_phase_->second);
       asked_phase_.reset();
     }
     const auto before = shaper_.overflowed.size();

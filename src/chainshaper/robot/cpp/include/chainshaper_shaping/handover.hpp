@@ -1,6 +1,6 @@
 // Which process publishes a shaped output: the shaping node, or the standby beside it. This is the
 // shaping node's side. `handover.py` (`Turn`) explains what the two agree on, and why; its page is
-// the same: numbers of 8 bytes, three rings, and the output's name. No ROS 2 here.
+// the same: numbers of 8 bytes, rings of such, and the output's name. No ROS 2 here.
 
 #pragma once
 
@@ -10,12 +10,25 @@
 #include <array>
 #include <cmath>
 #include <cstring>
+#include <limits>
 #include <memory>
 
 #include "guest.hpp"
 #include "shaper.hpp"
 
 namespace chainshaper {
+
+// A change of a gate's schedule that another process has asked for.
+struct Change {
+  std::int64_t from_ns;
+  std::int64_t what;  // schema::new_phase or schema::new_move
+  std::int64_t value;
+
+  // A damaged page may say anything: a sum of this time and a cycle must not overflow.
+  bool is_sound() const {
+    return 0 <= from_ns && from_ns <= std::numeric_limits<std::int64_t>::max() / 4;
+  }
+};
 
 // The file is read and written, never mapped: SIGBUS ends a process that maps a file which another
 // process cuts short, or for which the disk has no room. Numbers that are not there read as 0.
@@ -64,6 +77,21 @@ public:
 
   // Returns whether other processes find this page, and whole.
   bool is_current() const { return file_.is_open() && file_.is_at(path_, size); }
+
+  // Returns the changes of the gate's schedule behind the first `since` that are still there.
+  std::vector<Change> asked(std::int64_t since) const {
+    const auto last = get(Field::asked);
+    std::vector<Change> changes;
+    if (last <= since || last < 0) return changes;
+    std::array<std::int64_t, 3 * schema::changes> numbers{};
+    read_at(schema::asked, numbers.data(), numbers.size());
+    const auto first = std::max({since, last - schema::changes, std::int64_t{0}});
+    for (auto number = first; number < last; ++number) {
+      const auto place = 3 * static_cast<std::size_t>(number % schema::changes);
+      changes.push_back({numbers[place], numbers[place + 1], numbers[place + 2]});
+    }
+    return changes;
+  }
 
   void note(std::size_t count, std::int64_t ring, std::int64_t value) {
     // A damaged page may say anything, so a place is always taken modulo the ring's length.
@@ -169,18 +197,19 @@ public:
   }
 
   // Gives a gate the phase and the mode of the gate before it in the same launch. From now on the
-  // page shows each of its decisions, and says how its slots are moved.
+  // page shows each of its decisions, and changes its schedule.
   template <typename Shaper>
   void go_on(Shaper & shaper) {
-    shaper.moved = [this] { return moved(); };
-    shaper.on_decision = [this](const Release & release, std::int64_t phase_ns) {
-      hold(release.at_ns, phase_ns, release.mode);
+    auto & queue = shaper.queue;
+    const auto & gate = queue.gate;
+    shaper.follow = [this, &queue] { follow(queue); };
+    shaper.on_decision = [this, cycle_ns = gate.cycle_ns](const Release & release) {
+      hold(release.at_ns, modulo(release.origin_ns, cycle_ns), release.mode);
     };
-    const auto & gate = shaper.queue.gate;
     if (page_->get(Field::phase_known) != 0)  // from now on, not the next cycle
-      shaper.set_phase(page_->get(Field::phase_ns), monotonic_ns() - gate.cycle_ns);
+      queue.set_phase(page_->get(Field::phase_ns), monotonic_ns() - gate.cycle_ns);
     const auto mode = static_cast<std::size_t>(page_->get(Field::mode));  // from 1; 0: none
-    if (mode > 0 && mode <= gate.modes.size()) shaper.announce(gate.modes[mode - 1], 0);
+    if (mode > 0 && mode <= gate.modes.size()) queue.switch_mode(mode - 1, 0);
   }
 
   bool take(std::int64_t key) {
@@ -216,6 +245,12 @@ public:
     return true;
   }
 
+  // Returns whether the standby has dealt with this message, which is behind the one in hand: that
+  // one would come after it. To be called after `was_bypassed`.
+  bool is_overtaken_by(std::int64_t key) const {
+    return std::binary_search(bypassed_.begin(), bypassed_.end(), key);
+  }
+
   void done(std::int64_t key) {
     drop(key);
     page_->set(Field::until_ns, monotonic_ns());
@@ -223,7 +258,6 @@ public:
     if (page_->is_current()) return;
     try {
       auto next = opened();
-      move_back_ = page_->get(Field::moved_from_ns) != 0;
       for (const auto one : page_->noted(schema::released))
         next->note(Field::released, schema::released, one);  // for a standby behind
       page_ = std::move(next);
@@ -237,21 +271,29 @@ public:
 
   void drop(std::int64_t key) { page_->note(Field::released, schema::released, key); }
 
-  // Returns where cycles are asked to start, once for each time that was asked; none: no change.
-  Maybe asked_phase_ns() {
-    const auto asked = page_->get(Field::phases_asked);
-    if (asked == phases_asked_) return std::nullopt;
-    phases_asked_ = asked;
-    return page_->get(Field::asked_phase_ns);
-  }
-
-  std::optional<Move> moved() {
-    const auto since = page_->get(Field::moved_from_ns);
-    const auto by = page_->get(Field::moved_ns);
-    const bool back = std::exchange(move_back_, false);
-    if (!back && (since == 0 || since != page_->get(Field::moved_from_ns))) return std::nullopt;
-    if (back || !page_->is_locked(schema::moving)) return Move{monotonic_ns(), 0};
-    return Move{since, by};
+  // Takes over what was asked for since the last call into the schedules of a gate; slots go back
+  // to the planned ones where the process that had them moved has ended.
+  template <typename Queue>
+  void follow(Queue & queue) {
+    auto changes = std::exchange(moves_before_, {});
+    const auto asked = page_->get(Field::asked);
+    if (asked != asked_) {
+      const auto since = page_->asked(asked_);
+      changes.insert(changes.end(), since.begin(), since.end());
+      asked_ = asked;
+    }
+    const auto is_move = [](const Change & each) { return each.what == schema::new_move; };
+    has_moved_ = has_moved_ || std::any_of(changes.begin(), changes.end(), is_move);
+    const bool is_following = has_moved_ && page_->is_locked(schema::moving);
+    for (const Change & each : changes) {
+      if (!each.is_sound()) continue;
+      if (each.what == schema::new_phase) queue.set_phase(each.value, each.from_ns);
+      if (is_move(each) && is_following) queue.move_slots(each.value, each.from_ns);
+    }
+    if (has_moved_ && !is_following) {
+      queue.move_slots(0, monotonic_ns());
+      has_moved_ = false;
+    }
   }
 
   template <typename Message>
@@ -281,7 +323,12 @@ private:
     }
     page->set(Field::parent, parent);
     page->set(Field::in_process, in_process_ ? 1 : 0);
-    phases_asked_ = page->get(Field::phases_asked);
+    // A phase that was asked for before is that of another gate; a move is in force for as long as
+    // its process lives.
+    asked_ = page->get(Field::asked);
+    moves_before_.clear();
+    for (const Change & each : page->asked(0))
+      if (each.what == schema::new_move) moves_before_.push_back(each);
     return page;
   }
 
@@ -315,8 +362,9 @@ private:
   std::unique_ptr<Page> page_;
   bool in_force_{false};
   bool gave_up_{false};
-  bool move_back_{false};  // slots were moved by way of a page that was left
-  std::int64_t phases_asked_{0};
+  bool has_moved_{false};             // slots are where another process has asked for them
+  std::int64_t asked_{0};             // so many changes had been asked for at the last look
+  std::vector<Change> moves_before_;  // that were asked for before this gate opened the page
   // How many messages the standby had dealt with at the last look, and which.
   std::int64_t seen_{-1};
   std::int64_t oldest_{0};

@@ -39,7 +39,8 @@ inline Gate gate_of(const Parameters & parameters, std::size_t depth) {
   gate.depth = depth;
   if (!parameters.mode_topic.empty()) {
     gate.modes = parameters.mode_names;
-    gate.bands.assign(parameters.mode_slots.begin(), parameters.mode_slots.end());
+    for (const auto number : parameters.mode_slots)  // from 1, as bands of a plan
+      gate.mode_slots.push_back(static_cast<std::size_t>(number - 1));
     gate.first_mode = word_named<std::size_t>(gate.modes, parameters.mode_default);
     gate.late = word_named<Policy>(policy_names, parameters.mode_late);
   }
@@ -135,7 +136,7 @@ inline std::int64_t clock_offset() {
 }
 
 // A gate at work, with `Message`s in its queue. The owner sets the functions that it calls: `look`,
-// `moved`, `on_waking` and `on_decision`.
+// `follow`, `on_waking` and `on_decision`.
 template <typename Message>
 class Shaper {
 public:
@@ -145,20 +146,7 @@ public:
   Shaper(const Shaper &) = delete;
   Shaper & operator=(const Shaper &) = delete;
 
-  void set_phase(std::int64_t phase_ns, std::int64_t now_ns) {
-    next_phase_ = {now_ns + modulo(phase_ns - now_ns, queue.gate.cycle_ns), phase_ns};
-  }
-
-  void move_slots(std::int64_t by_ns, std::int64_t from_ns) {
-    const auto & moves = queue.moves;
-    if (by_ns != (moves.empty() ? 0 : moves.back().second) && queue.gate.may_move(by_ns))
-      remember(queue.moves, Move{from_ns, by_ns});
-  }
-
-  void follow_moves() {
-    if (const auto move = moved()) move_slots(move->second, move->first);
-  }
-
+  // Puts a mode in force from the next cycle on; returns whether there is one of that name.
   bool announce(const std::string & name, std::int64_t now_ns) {
     const auto mode = place_of(queue.gate.modes, name);
     if (!mode) return false;
@@ -177,11 +165,7 @@ public:
     if (stepped) queue.doubt_stamps(arrival_ns);
     if (waited && source_timestamp && !stepped)
       arrival_ns = std::min(arrival_ns, std::max(looked_ns_, *source_timestamp - offset));
-    if (next_phase_ && arrival_ns >= next_phase_->first) {
-      queue.phase_ns = next_phase_->second;
-      next_phase_.reset();
-    }
-    follow_moves();
+    follow();
     auto full = queue.arrive(std::move(message), arrival_ns, stamp_ns, source_timestamp, lost);
     if (full) overflowed.push_back(std::move(*full));
   }
@@ -192,7 +176,7 @@ public:
     std::int64_t now = monotonic_ns();
     turn_ns_ = now;  // before, this thread was busy with the message before it
     Release release = queue.decide();
-    on_decision(release, queue.phase_ns);
+    on_decision(release);
     bool slept = false;
     if (release.at_ns) {
       waited_ns_ = others_ran_ns();
@@ -202,7 +186,8 @@ public:
         look_again();
         now = monotonic_ns();
       }
-      if (!slept && queue.gate.messages == Messages::newest) look_again();
+      // The first time, it may have come long ago, and newer ones since.
+      if (!slept && (queue.gate.messages == Messages::newest || looked_ns_ == 0)) look_again();
       if (queue.waiting.front().number != number) return std::nullopt;
       if (queue.replaced(release, now)) release.drop(Dropped::replaced);
     }
@@ -238,9 +223,9 @@ public:
   Queue<Message> queue;
   std::vector<Outcome<Message>> overflowed;  // since the owner emptied this list
   std::function<void()> look = [] {};
-  std::function<std::optional<Move>()> moved = [] { return std::nullopt; };
+  std::function<void()> follow = [] {};
   std::function<void(std::int64_t)> on_waking = [](std::int64_t) {};
-  std::function<void(const Release &, std::int64_t)> on_decision = [](const auto &...) {};
+  std::function<void(const Release &)> on_decision = [](const Release &) {};
 
 private:
   bool nothing_due(std::int64_t until_ns) {
@@ -278,7 +263,6 @@ private:
   std::int64_t turn_ns_{0};
   File schedstat_;
   pid_t thread_{-1};
-  std::optional<std::pair<std::int64_t, std::int64_t>> next_phase_;  // from when on, and the phase
 };
 
 }  // namespace chainshaper
