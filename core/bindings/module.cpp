@@ -5,6 +5,7 @@
 namespace chainshaper::bindings {
 
 void bind_bands(nanobind::module_ & module);
+void bind_columns(nanobind::module_ & module);
 void bind_ctf(nanobind::module_ & module);
 void bind_matching(nanobind::module_ & module);
 void bind_simulation(nanobind::module_ & module);
@@ -14,6 +15,7 @@ void bind_simulation(nanobind::module_ & module);
 NB_MODULE(_core, module) {
   module.doc() = "What must be fast: trace decoder, joins, band placement, simulator (C++).";
   chainshaper::bindings::bind_bands(module);
+  chainshaper::bindings::bind_columns(module);
   chainshaper::bindings::bind_ctf(module);
   chainshaper::bindings::bind_matching(module);
   chainshaper::bindings::bind_simulation(module);
