@@ -45,8 +45,9 @@ from numpy.typing import NDArray
 
 from chainshaper.monitor import watch as watch_module
 from chainshaper.monitor.watch import Watch
-from chainshaper.sources.preload import _HEADER, _RING, RECORD, TracedProcess, event_names
+from chainshaper.sources.preload import RECORD, TracedProcess, event_names
 from chainshaper.sources.preload.events_header import FORMAT
+from chainshaper.sources.preload.memory import HEADER, RING
 from chainshaper.values.durations import parse_duration
 
 US, MS, SECOND = 1_000, 1_000_000, 1_000_000_000
@@ -137,7 +138,7 @@ class Process:
     def __init__(self, pid: int, callbacks: Collection[Callback], created_ns: int) -> None:
         self.pid, self.written = pid, [0] * RINGS
         self.file = os.memfd_create("watch-week", os.MFD_ALLOW_SEALING)
-        self._of_objects = _HEADER.itemsize + RINGS * _RING.itemsize
+        self._of_objects = HEADER.itemsize + RINGS * RING.itemsize
         records = OBJECT_RECORDS + RINGS * RING_RECORDS
         os.ftruncate(self.file, self._of_objects + records * RECORD.itemsize)
         fcntl.fcntl(self.file, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
@@ -149,7 +150,7 @@ class Process:
                 words = np.frombuffer(text.encode().ljust(40, b"\0"), np.uint64).tolist()
                 objects.append(_record(created_ns, pid, 1, [16 * len(text) + place, *words]))
         sizes = (RINGS, RING_RECORDS, OBJECT_RECORDS)
-        header = np.array([(0x63687368, FORMAT, pid, *sizes, len(objects), 0, 0, [0] * 2)], _HEADER)
+        header = np.array([(0x63687368, FORMAT, pid, *sizes, len(objects), 0, 0, [0] * 2)], HEADER)
         os.pwrite(self.file, np.array(objects, RECORD).tobytes(), self._of_objects)
         os.pwrite(self.file, header.tobytes(), 0)
 
@@ -167,7 +168,7 @@ class Process:
                 os.pwrite(self.file, own.data, self._of_objects + start * RECORD.itemsize)
         self.written[ring] += records.size
         count = self.written[ring].to_bytes(8, "little")
-        os.pwrite(self.file, count, _HEADER.itemsize + ring * _RING.itemsize)
+        os.pwrite(self.file, count, HEADER.itemsize + ring * RING.itemsize)
 
 
 class Application:

@@ -13,7 +13,7 @@ import pytest
 from calm_runs import calm_run
 from cores import cores
 from hypothesis import settings
-from ros2 import ros2_environment
+from ros2 import require_lttng_of_ros2, ros2_environment
 from small_chain import EXECUTOR_CORE, small_chain, small_chain_plan, small_chain_text
 
 from chainshaper import run_application, shape_application, simulate
@@ -151,6 +151,12 @@ def in_ros2() -> Iterator[None]:
     """What a test starts is started in the environment of ROS 2."""
     with mock.patch.dict(os.environ, ros2_environment()):
         yield
+
+
+@pytest.fixture
+def lttng_of_ros2() -> None:
+    """LTTng records ROS 2 here; else the test is skipped, with the reason."""
+    require_lttng_of_ros2()
 
 
 @pytest.fixture

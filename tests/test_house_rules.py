@@ -24,11 +24,9 @@ ALLOWED_PARAMETERS = {
 
 ALLOWED_LENGTH = {
     "flow/apply.py: apply_plan": "a run from its claim to its end, in order: each line is a step",
-    "flow/launch_splicing.py: splice_launch_files": "to be cut",
-    "flow/launch_shaping.py: shape_launch": "to be cut: it holds the story of the whole verb",
-    "flow/plan.py: _profile_of": "to be cut: it makes one value of 37 fields",
-    "workload/live.py: run_application": "to be cut: it holds the order of a whole live run",
+    "flow/recorded_profile/chain_profile.py: profile_of": "it makes one value of 37 fields",
 }
+
 
 class Measured(NamedTuple):
     name: str  # "FILE: FUNCTION"

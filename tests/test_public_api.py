@@ -45,7 +45,7 @@ def test_importing_the_command_line_loads_nothing_heavy() -> None:
 
 def test_a_plan_without_a_recording_is_applied_without_what_reads_recordings() -> None:
     """Robots, and guests of other kernels, have Pydantic and NumPy alone."""
-    statement = "from chainshaper.flow import apply; apply.threads.evidence_of(None)"
+    statement = "from chainshaper.flow import apply; apply.evidence_of(None)"
     assert _modules_after(statement).isdisjoint({"polars", "matplotlib", "cyclonedds", "rich"})
 
 

@@ -5,20 +5,20 @@
 namespace chainshaper::bands {
 namespace {
 
-// As a function of the count c of latencies before it, a next band at place j costs
-// base(j) − c · ends_ns[j]: a line. The least of all lines at c is their lower envelope.
+// If c latencies are before it, the next band at place j costs base(j) − c · ends_ns[j]. As a
+// function of c that is a line; the lowest of all lines at each c is their lower envelope.
 struct Line {
   std::size_t place;
   std::int64_t base_ns;
-  std::int64_t takes_over;  // the signed count from which this line is below the one before it
+  std::int64_t takes_over;  // the signed count from which it is below the line before it
 };
 
-// The lower envelope of lines whose slopes come in one order, asked for counts in one order: both
-// adding a line and asking take constant time on average.
+// The lower envelope of lines. If lines are added in order of their slopes, and counts asked for in
+// order, both take constant time on average.
 class Envelope {
 public:
-  // `direction` is 1 where slopes grow from line to line and −1 where they fall; counts come in the
-  // opposite order, so that the signed counts −direction · c always fall.
+  // `direction` is 1 if slopes grow from line to line, and −1 if they fall. Counts come in the
+  // opposite order, so the signed counts −direction · c always fall.
   Envelope(const Grid & grid, int direction) : grid_(grid), direction_(direction) {}
 
   void clear() {
@@ -32,14 +32,14 @@ public:
       const Line & last = lines_.back();
       const auto apart_ns = direction_ * (grid_.ends_ns[place] - grid_.ends_ns[last.place]);
       takes_over = floor_divide(last.base_ns - base_ns, apart_ns);
-      // A line that is overtaken before it takes over itself is nowhere the lowest.
+      // The last line is nowhere the lowest if the new one is below it before it takes over.
       if (lines_.size() - 1 == front_ || takes_over < last.takes_over) break;
       lines_.pop_back();
     }
     lines_.push_back({place, base_ns, takes_over});
   }
 
-  // The lowest line at this count; none where no line was added.
+  // Returns the lowest line at this count; nullptr: no line was added.
   const Line * lowest_at(std::int64_t count) {
     while (front_ + 1 < lines_.size() && -direction_ * count <= lines_[front_ + 1].takes_over)
       ++front_;
@@ -71,10 +71,10 @@ void lower_cost(const Grid & grid, Layer layer, std::size_t place, Envelope & en
 
 }  // namespace
 
-// Windows [nearest, farthest] move up with the place: they lose lines at one side as they gain some
-// at the other, which an envelope cannot. So places are taken in blocks whose windows all have one
-// column, the pivot, in common. Left of the pivot, windows only grow from the block's last place to
-// its first; right of it, from the first to the last.
+// The windows [nearest, farthest] move up with the place: they lose lines at one end and gain lines
+// at the other. From an envelope lines cannot be removed. So places are taken in blocks whose
+// windows all contain one column, the pivot. To the left of the pivot, windows only grow from the
+// block's last place to its first; to the right of it, from its first place to its last.
 void add_band(const Grid & grid, std::span<const std::int64_t> behind, Layer layer) {
   const auto places = static_cast<std::int64_t>(grid.ends_ns.size());
   const auto index = [](std::int64_t place) { return static_cast<std::size_t>(place); };
@@ -101,7 +101,7 @@ void add_band(const Grid & grid, std::span<const std::int64_t> behind, Layer lay
       for (; column <= grid.farthest[index(place)]; ++column) add(rightwards, column);
       lower_cost(grid, layer, index(place), rightwards);
     }
-    first = std::max(stop, first + 1);  // no column is in the window of the first place
+    first = std::max(stop, first + 1);  // at least one further: a window may be empty
   }
 }
 

@@ -11,28 +11,28 @@
 
 namespace chainshaper::bands {
 
-// The cost of bands that no placement reaches.
+// The cost where no placement is allowed.
 inline constexpr std::int64_t unreachable = std::numeric_limits<std::int64_t>::max();
 
 // The places that a band's end may have. All spans have one entry for each place, ascending.
 struct Grid {
-  std::span<const std::int64_t> ends_ns;   // when a band at this place ends, from the anchor
-  std::span<const std::int64_t> counts;    // so many latencies are not longer than that
+  std::span<const std::int64_t> ends_ns;   // when a band at this place ends, after the anchor
+  std::span<const std::int64_t> counts;    // how many latencies are not longer than that
   std::span<const std::int64_t> nearest;   // the next band's first place that is allowed
   std::span<const std::int64_t> farthest;  // the next band's last place that is allowed
 };
 
-// What is known of each place once a number of bands stands behind it.
+// For each place, the best bands behind it, of which there is a given number.
 struct Layer {
-  std::span<std::int64_t> costs;       // the least sum of eq. 5 over the bands behind, in ns
-  std::span<std::int32_t> successors;  // where the next band is; unchanged where none is allowed
+  std::span<std::int64_t> costs;       // the least sum of eq. 5 over these bands (ns)
+  std::span<std::int32_t> successors;  // the place of the next band; unchanged if none is allowed
 };
 
 // Adds one band: for each place i the least cost over the next band's places j,
 //
 //     (counts[j] − counts[i]) · ends_ns[j] + behind[j],   nearest[i] ≤ j ≤ farthest[i],
 //
-// where behind[j] is not `unreachable`. Takes time linear in the number of places.
+// over all j for which behind[j] is not `unreachable`. Takes time linear in the number of places.
 void add_band(const Grid & grid, std::span<const std::int64_t> behind, Layer layer);
 
 }  // namespace chainshaper::bands

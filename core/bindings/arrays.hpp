@@ -24,14 +24,14 @@ std::span<T> span_of(const Array<T> & array) {
   return {array.data(), array.size()};
 }
 
-// Raises ValueError where an array has another length than the rows that it belongs to.
+// Throws std::invalid_argument (ValueError in Python) if an array has not the expected length.
 inline void check_length(const char * name, std::size_t length, std::size_t expected) {
   if (length != expected)
     throw std::invalid_argument(std::string(name) + " has " + std::to_string(length) +
                                 " entries where " + std::to_string(expected) + " are needed");
 }
 
-// A vector as a NumPy array, which owns its memory.
+// Moves a vector into a NumPy array, which owns the memory.
 template <typename T>
 nb::ndarray<nb::numpy, T, nb::ndim<1>> array_of(std::vector<T> && rows) {
   auto * owned = new std::vector<T>(std::move(rows));
@@ -41,7 +41,7 @@ nb::ndarray<nb::numpy, T, nb::ndim<1>> array_of(std::vector<T> && rows) {
   return {owned->data(), {owned->size()}, owner};
 }
 
-// What `work` returns. It runs without Python's lock, so that other threads run beside it.
+// Calls `work` without Python's lock, so that other threads can run, and returns its result.
 template <typename Work>
 auto without_lock(Work && work) {
   const nb::gil_scoped_release released;

@@ -9,7 +9,7 @@ namespace {
 
 using Numbers = Array<const std::int64_t>;
 
-// Windows from outside: a wrong one must be an error, never memory of others.
+// Windows come from Python: a wrong one must be an error, not an access to other memory.
 void check_windows(const bands::Grid & grid) {
   const auto places = static_cast<std::int64_t>(grid.ends_ns.size());
   const bool ascend = std::is_sorted(grid.nearest.begin(), grid.nearest.end()) &&

@@ -79,7 +79,7 @@ void bind_types(nb::module_ & module) {
       .def_static("structure", &structure, nb::kw_only(), nb::arg("fields"), nb::arg("align"),
                   "Fields that follow each other.")
       .def_static("variant", &variant, nb::kw_only(), nb::arg("tag").none(), nb::arg("options"),
-                  "What an enumeration before it chooses.");
+                  "One of several types, which an enumeration before it chooses.");
 
   nb::class_<ctf::EventClass>(module, "CtfEventClass", "What an event class declares.")
       .def(
@@ -130,7 +130,7 @@ void bind_types(nb::module_ & module) {
 // Layout
 
 void bind_layout(nb::module_ & module) {
-  nb::enum_<ctf::Scope>(module, "CtfScope", "Where behind an event's header a field stands.")
+  nb::enum_<ctf::Scope>(module, "CtfScope", "The part of an event in which a field is.")
       .value("STREAM_EVENT_CONTEXT", ctf::Scope::stream_event_context)
       .value("EVENT_CONTEXT", ctf::Scope::event_context)
       .value("EVENT_FIELDS", ctf::Scope::event_fields);
@@ -155,7 +155,7 @@ void bind_layout(nb::module_ & module) {
           nb::arg("traces"), nb::arg("wanted"))
       .def_ro("traces", &ctf::Layout::traces, "The stream classes of each trace: first and end.");
 
-  // As ValueError(reason, trace): which trace, so that a message can name its file.
+  // It becomes ValueError(reason, trace): with the trace, a message can name its file.
   nb::register_exception_translator([](const std::exception_ptr & thrown, void * /*payload*/) {
     try {
       std::rethrow_exception(thrown);
@@ -175,18 +175,19 @@ nb::object column_of(const std::vector<ctf::Packet> & packets, Member member) {
   return nb::cast(array_of(std::move(column)));
 }
 
-nb::dict columns_of(const ctf::FoundPackets & found) {
+nb::dict columns_of(const ctf::FoundPackets & file) {
+  const auto & packets = file.packets;
   nb::dict columns;
-  columns["offset"] = column_of(found.packets, &ctf::Packet::offset);
-  columns["size"] = column_of(found.packets, &ctf::Packet::size);
-  columns["content_bits"] = column_of(found.packets, &ctf::Packet::content_bits);
-  columns["stream_class"] = column_of(found.packets, &ctf::Packet::stream_class);
-  columns["instance"] = column_of(found.packets, &ctf::Packet::instance);
-  columns["begin"] = column_of(found.packets, &ctf::Packet::begin);
-  columns["end"] = column_of(found.packets, &ctf::Packet::end);
-  columns["sequence"] = column_of(found.packets, &ctf::Packet::sequence);
-  columns["discarded"] = column_of(found.packets, &ctf::Packet::discarded);
-  columns["cpu"] = column_of(found.packets, &ctf::Packet::cpu);
+  columns["offset"] = column_of(packets, &ctf::Packet::offset);
+  columns["size"] = column_of(packets, &ctf::Packet::size);
+  columns["content_bits"] = column_of(packets, &ctf::Packet::content_bits);
+  columns["stream_class"] = column_of(packets, &ctf::Packet::stream_class);
+  columns["instance"] = column_of(packets, &ctf::Packet::instance);
+  columns["begin"] = column_of(packets, &ctf::Packet::begin);
+  columns["end"] = column_of(packets, &ctf::Packet::end);
+  columns["sequence"] = column_of(packets, &ctf::Packet::sequence);
+  columns["discarded"] = column_of(packets, &ctf::Packet::discarded);
+  columns["cpu"] = column_of(packets, &ctf::Packet::cpu);
   return columns;
 }
 
@@ -225,7 +226,7 @@ void bind_packets(nb::module_ & module) {
 
 // Events
 
-// The arrays of a table, kept alive, and where they are.
+// The columns of a table, and the arrays that they are in, which are kept alive.
 struct EventTable {
   std::vector<nb::object> arrays;
   ctf::TableColumns columns;
@@ -240,7 +241,7 @@ ctf::Column column_of(const nb::ndarray<nb::ndim<1>, nb::c_contig, nb::device::c
   return {static_cast<std::uint8_t *>(array.data()), type.bits / 8, array.size()};
 }
 
-// A stream file while its events are read. The layout lives as long (keep_alive).
+// A stream file while its events are read. `keep_alive` lets the layout live as long.
 struct EventFile {
   File file;
   ctf::EventReader reader;

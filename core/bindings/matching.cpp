@@ -62,14 +62,14 @@ void bind_matching(nb::module_ & module) {
   module.def("latest_before", nearest_rows(matching::Direction::latest_before), nb::kw_only(),
              nb::arg("left_keys"), nb::arg("left_times_ns"), nb::arg("right_keys"),
              nb::arg("right_times_ns"), nb::arg("strictly") = false,
-             "For each row of the left table the latest row of the right one with its key.");
+             "Return, for each left row, the latest right row of its key that is not later.");
   module.def("first_after", nearest_rows(matching::Direction::first_after), nb::kw_only(),
              nb::arg("left_keys"), nb::arg("left_times_ns"), nb::arg("right_keys"),
              nb::arg("right_times_ns"), nb::arg("strictly") = false,
-             "For each row of the left table the next row of the right one with its key.");
+             "Return, for each left row, the first right row of its key that is not earlier.");
   module.def("ends_of_starts", &ends_of_starts, nb::kw_only(), nb::arg("start_keys"),
              nb::arg("start_times_ns"), nb::arg("end_keys"), nb::arg("end_times_ns"),
-             "For each start the row of its end.");
+             "Return, for each start, the row of its end, or NO_ROW.");
 }
 
 }  // namespace chainshaper::bindings

@@ -13,7 +13,7 @@ void bind_simulation(nanobind::module_ & module);
 }  // namespace chainshaper::bindings
 
 NB_MODULE(_core, module) {
-  module.doc() = "What must be fast: trace decoder, joins, band placement, simulator (C++).";
+  module.doc() = "The native library (C++): trace decoder, joins, band placement, simulator.";
   chainshaper::bindings::bind_bands(module);
   chainshaper::bindings::bind_columns(module);
   chainshaper::bindings::bind_ctf(module);

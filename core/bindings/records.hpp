@@ -15,7 +15,7 @@
 
 namespace chainshaper::bindings {
 
-// A class whose constructor takes any of the fields that are bound, by name; others are as usual.
+// Binds a class whose constructor takes any bound fields by name; other fields have their defaults.
 template <typename Struct>
 nb::class_<Struct> record(nb::module_ & module, const char * name, const char * description) {
   return nb::class_<Struct>(module, name, description)
@@ -26,7 +26,7 @@ nb::class_<Struct> record(nb::module_ & module, const char * name, const char * 
       });
 }
 
-// The value of an enumeration that a word stands for, by its place in the words.
+// Returns the value of an enumeration for a word. The words are in the order of the values.
 template <typename Value, typename Words>
 Value value_of(const Words & words, const std::string & word) {
   for (std::size_t place = 0; place < words.size(); ++place)
@@ -34,13 +34,13 @@ Value value_of(const Words & words, const std::string & word) {
   throw std::invalid_argument("'" + word + "' is not a word that is known here");
 }
 
-// A column that is Python's from now on.
+// Gives a column to Python, which owns its memory then.
 template <typename Number>
 nb::object column_of(std::vector<Number> && numbers) {
   return nb::cast(array_of(std::move(numbers)));
 }
 
-// The same, of the first numbers of an array.
+// Gives the first `count` numbers of an array to Python, as a column.
 template <typename Number>
 nb::object column_of(std::unique_ptr<Number[]> && numbers, std::size_t count) {
   Number * column = numbers.release();

@@ -18,11 +18,11 @@ using Pairs = std::vector<std::pair<std::int64_t, std::int64_t>>;
 using Constants = std::vector<std::optional<Nanoseconds>>;
 
 void bind_kinds(nb::module_ & module) {
-  nb::enum_<Role>(module, "Role", "Who works in a thread.")
+  nb::enum_<Role>(module, "Role", "What a thread is for.")
       .value("executor", Role::executor)
       .value("publisher", Role::publisher)
       .value("dds", Role::dds);
-  nb::enum_<ExecutorKind>(module, "ExecutorKind", "In which order an executor does what is ready.")
+  nb::enum_<ExecutorKind>(module, "ExecutorKind", "In which order an executor runs callbacks.")
       .value("single_threaded", ExecutorKind::single_threaded)
       .value("static_single_threaded", ExecutorKind::static_single_threaded)
       .value("events", ExecutorKind::events)
@@ -37,7 +37,7 @@ void bind_kinds(nb::module_ & module) {
       .value("gate", Body::gate)
       .value("mode_listener", Body::mode_listener)
       .value("synchronise", Body::synchronise);
-  nb::enum_<Pause>(module, "Pause", "Why the engine was left.")
+  nb::enum_<Pause>(module, "Pause", "Why `Simulation.run` has returned.")
       .value("none", Pause::none)
       .value("log_full", Pause::log_full)
       .value("messages_full", Pause::messages_full)
@@ -104,7 +104,7 @@ void bind_callbacks(nb::module_ & module) {
       .def_rw("depth", &EntityDescription::depth)
       .def_rw("starts_chain", &EntityDescription::starts_chain)
       .def_rw("on_chain", &EntityDescription::on_chain);
-  record<Reader>(module, "ReaderDescription", "Who reads what a publisher publishes.")
+  record<Reader>(module, "ReaderDescription", "A subscription that reads a publisher.")
       .def_rw("entity", &Reader::entity)
       .def_rw("delivery", &Reader::delivery, nb::arg().none());
   record<PublisherDescription>(module, "PublisherDescription", "A callback's publisher of a topic.")
@@ -120,7 +120,7 @@ void bind_callbacks(nb::module_ & module) {
   record<Input>(module, "InputDescription", "An input of a synchroniser.")
       .def_rw("on_chain", &Input::on_chain)
       .def_rw("depth", &Input::depth);
-  record<SynchroniserDescription>(module, "SynchroniserDescription", "Inputs that come together.")
+  record<SynchroniserDescription>(module, "SynchroniserDescription", "A synchroniser of inputs.")
       .def_rw("inputs", &SynchroniserDescription::inputs)
       .def_rw("trigger", &SynchroniserDescription::trigger, nb::arg().none());
 }
@@ -167,7 +167,7 @@ void bind_gate(nb::module_ & module) {
       property(name, word_of(member, words...));
   });
   property("mode_names", value_in(&Gate::modes));
-  property("bands", value_in(&Gate::bands));
+  property("mode_slots", value_in(&Gate::mode_slots));
   property("first_mode", value_in(&Gate::first_mode));
   property("late", word_of(&Gate::late, policy_names));
   property("depth", value_in(&Gate::depth));
@@ -179,7 +179,7 @@ void bind_gate(nb::module_ & module) {
 
 void bind_description(nb::module_ & module) {
   record<Description>(module, "Description",
-                      "What is simulated; parts refer to each other by place.")
+                      "A system to simulate; parts refer to each other by place in their lists.")
       .def_rw("cores", &Description::cores)
       .def_rw("threads", &Description::threads)
       .def_rw("processes", &Description::processes)
@@ -214,7 +214,7 @@ void bind_description(nb::module_ & module) {
       .def_rw("most_messages", &Description::most_messages);
 }
 
-// Asks Python for numbers: the engine works without its lock.
+// Makes a source that asks Python for numbers; it takes Python's lock, which the engine has not.
 Source source_from(nb::callable draw) {
   return [draw = std::move(draw)](Place stream) {
     const nb::gil_scoped_acquire acquired;
@@ -223,7 +223,7 @@ Source source_from(nb::callable draw) {
   };
 }
 
-// Adds columns `pid`, `tid` and `cpu` of entries, by their threads; 0 for the idle thread.
+// Adds the columns `pid`, `tid` and `cpu` of each entry's thread; the idle thread has 0.
 void add_threads(nb::dict & columns, const std::vector<ThreadDescription> & threads,
                  const EntryColumns & entries) {
   auto pids = std::make_unique_for_overwrite<std::int32_t[]>(entries.count);
@@ -275,14 +275,14 @@ void bind_simulation(nb::module_ & module) {
             new (place) Engine(description, source_from(std::move(draw)));
           },
           nb::arg("description"), nb::arg("draw"),
-          "`draw(stream)` gives the next numbers of a stream. Raises ValueError: it makes no "
-          "sense.")
+          "`draw(stream)` returns the next numbers of a stream. Raises ValueError: the description "
+          "is contradictory.")
       .def("run", &Engine::run, nb::arg("most_instants"), nb::call_guard<nb::gil_scoped_release>(),
            "Go on until the end, until the log is full, or for so many instants.")
-      .def("take_log", &take_log, "What was logged: columns by the names of entries and of fields.")
+      .def("take_log", &take_log, "Return and empty the log: columns by names of entry and field.")
       .def(
           "latencies", [](const Engine & engine) { return column_of(engine.latencies()); },
-          "Of each instance of the chain (ns); -1: it did not complete.")
+          "Return the latency of each instance of the chain (ns); -1: it did not complete.")
       .def_prop_ro("now_ns", &Engine::now);
 }
 

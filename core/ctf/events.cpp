@@ -7,7 +7,7 @@
 namespace chainshaper::ctf {
 namespace {
 
-// So many bytes of zeros from an event's header on are no event.
+// If all bytes of a header are zeros, and so many behind it, there is no event.
 constexpr std::int64_t zeros_of_no_event = 32;
 
 // Bytes ahead of an event that are fetched while it is read.
@@ -30,7 +30,7 @@ public:
   const Content & content() const { return content_; }
   const StreamLayout & stream() const { return stream_; }
 
-  // The position of the packet's first event.
+  // Reads the packet's header and context; returns the position of its first event.
   Reached open() const {
     run_.forget_variables();
     if (content_.end == 0) return 0;
@@ -46,7 +46,7 @@ public:
       const auto byte = static_cast<std::size_t>(at >> 3);
       if (behind <= content_.end && byte + 8 <= content_.bytes.size()) {
         const auto * place = content_.bytes.data() + byte;
-        // Loading the next headers is most of the work: packets come from outside the caches.
+        // Waiting for the memory of the next headers would take most of the time.
         if (byte + read_ahead < content_.bytes.size()) __builtin_prefetch(place + read_ahead);
         const auto word = load<std::uint64_t>(place);
         const auto last = low_bits(~std::uint64_t{0}, quick.id_bits);
@@ -62,7 +62,7 @@ public:
     return named(run_.variable(event_id), behind.bits());
   }
 
-  // The position behind an event's contexts and payload, of which nothing is written.
+  // Returns the position behind an event's contexts and payload, without writing anything.
   Reached step_over(const EventLayout & event, std::int64_t position) const {
     if (event.align != 0) {
       const auto behind = align_up(position, event.align) + event.size;
@@ -84,8 +84,7 @@ private:
   Run & run_;
 };
 
-// Whether a tracer can have written an event whose header is from `position` to `behind`: it
-// happened while its packet was open, in a process; and what a disk never got reads as zeros.
+// Whether a header and the bytes behind it are zeros, as where a disk has not got the data.
 bool only_zeros(const Content & content, std::int64_t position, std::int64_t behind) {
   const auto first = position >> 3, last = (behind >> 3) + zeros_of_no_event;
   if (last > content.end >> 3) return false;
@@ -100,6 +99,9 @@ bool is_zero(const Content & content, std::int64_t position) {
          load<std::uint32_t>(content.bytes.data() + static_cast<std::size_t>(at)) == 0;
 }
 
+// Checks that a tracer can have written an event whose header is from `position` to `behind`: it
+// happened while its packet was open, in a process, and its bytes are not all zeros. Returns
+// `behind`, or what is wrong.
 Reached believed(const Headers & headers, const PacketEvents & packet, const Run & run,
                  std::int64_t position, std::int64_t behind, const EventLayout * event_of_id_0,
                  const EventLayout * event) {

@@ -21,8 +21,8 @@
 
 namespace chainshaper::ctf {
 
-// Numbers that a run of steps notes for later steps or for the decoder. The first ones are those of
-// packet header and packet context; lengths and tags that types refer to follow.
+// Numbers that steps note for later steps, or for the decoder. The first ones are fields of the
+// packet header and packet context. Lengths and tags to which types refer follow.
 enum Variable : std::uint8_t {
   event_id,
   magic,
@@ -61,16 +61,16 @@ struct Step {
   bool big_endian{false};
   bool sets_clock{false};
   bool is_text{false};
-  std::int32_t variable{none};  // that a number sets, or that has the `count` or the tag
-  std::int32_t column{none};    // of the event's table, that the value goes to
-  std::int64_t align{1};
-  std::int64_t size{0};
-  std::int64_t count{0};  // where no variable has it
-  std::size_t target{0};
-  std::size_t first_range{0};  // of `choose`: in Layout::ranges
-  std::size_t ranges{0};
-  std::int64_t least{0};  // bits that an element of a loop takes at least
-  std::int64_t cost{0};   // of an element of a loop
+  std::int32_t variable{none};  // set by a number; or it has the `count`, or the tag of `choose`
+  std::int32_t column{none};    // column of the event's table to which the value goes
+  std::int64_t align{1};        // bits
+  std::int64_t size{0};         // bits
+  std::int64_t count{0};        // if it is constant, so that no variable has it
+  std::size_t target{0};        // a step
+  std::size_t first_range{0};   // of `choose`: its first one in Layout::ranges
+  std::size_t ranges{0};        // of `choose`: how many it has
+  std::int64_t least{0};        // the least bits of an element of a loop
+  std::int64_t cost{0};         // of an element of a loop, see run.hpp
 };
 
 // Steps [first, end) of a layout.
@@ -96,28 +96,30 @@ struct Move {
 };
 
 struct EventLayout {
-  // What pass 1 needs of an event of constant layout, whose steps are one:
-  std::int64_t align{0};  // 0 where the layout is not constant
+  // What pass 1 needs of an event of constant layout, which it passes over in one step:
+  std::int64_t align{0};  // 0: the layout is not constant
   std::int64_t size{0};
   std::int64_t cost{0};      // of header and steps, and the bytes of a row
-  std::int32_t table{none};  // that it goes to
-  bool is_moved{false};      // `moves` say all that is to be done
+  std::int32_t table{none};  // to which it goes
+  bool is_moved{false};      // whether pass 2 needs only `moves`, not `steps`
   Steps steps;               // of contexts and payload
   std::vector<Move> moves;
 };
 
-// LTTng's compact and large event headers, which a single load reads: an id of few bits, then the
-// clock's low bits. An id of all ones announces the long form, which is left to the steps.
+// LTTng's compact or large event header, if a stream has one: an id of few bits, then the clock's
+// low bits, which a single load reads. An id of all ones announces the long form, which the steps
+// read.
 struct QuickHeader {
-  std::int64_t align{0};  // 0: the header is another
+  std::int64_t align{0};  // 0: the stream has another header
   std::int64_t id_bits{0};
   std::int64_t clock_shift{0};
   std::int64_t clock_bits{0};
 };
 
-// Where behind an event's header the 32 bits of process and thread lie, bits from its alignment.
+// Where the process and the thread of an event are, as 32 bits each: bits from where the event's
+// contexts begin.
 struct ProcessPlace {
-  std::int64_t align{0};  // 0: not known, or a kernel's trace, where 0 is a number too
+  std::int64_t align{0};  // 0: not known; or a kernel's trace, in which 0 is a valid number
   std::int64_t process{0};
   std::int64_t thread{0};
 };
@@ -131,15 +133,15 @@ struct StreamLayout {
   ProcessPlace process;
   std::int64_t frequency_hz;
   std::int64_t packet_cost;
-  std::int64_t default_event{0};  // where events have no id
-  std::uint32_t known{0};         // bit n: packets say Variable n
+  std::int64_t default_event{0};  // the id of all events, if they say none
+  std::uint32_t known{0};         // bit n: packets have Variable n
   std::pair<std::int64_t, std::int64_t> uuid{0, 0};
   std::vector<std::int32_t> events;  // event class by small id, or `none`
-  std::vector<std::pair<std::int64_t, std::int32_t>> rare_events;  // the others, by ascending id
+  std::vector<std::pair<std::int64_t, std::int32_t>> rare_events;  // large id and class, ascending
 
   bool knows(Variable variable) const { return (known >> variable & 1) != 0; }
 
-  // The event class that an id names, in Layout::events; `none` for an undeclared one.
+  // Returns the event class of an id, in Layout::events; `none`: it is not declared.
   std::int32_t event(std::int64_t id_of_event) const {
     if (static_cast<std::uint64_t>(id_of_event) < events.size())
       return events[static_cast<std::size_t>(id_of_event)];
@@ -153,7 +155,7 @@ private:
 // The dynamic scopes that steps behind an event's header are of.
 enum class Scope : std::uint8_t { stream_event_context, event_context, event_fields };
 
-// A field that gets a column: which one of its scope's structure.
+// A field that gets a column: its number in the structure of its scope.
 struct ColumnField {
   Scope scope;
   std::size_t field;
@@ -189,23 +191,23 @@ struct Layout {
   }
 };
 
-// Sizes from here on are all the same: no packet is so long. Sums of two of them are still numbers.
+// Larger sizes are cut to this one, which no packet has. The sum of two of them does not overflow.
 inline constexpr std::int64_t endless_bits = std::int64_t{1} << 56;
 
-// Why a trace cannot be laid out: a length or tag that is no number, too deep a nesting, columns
-// that are none.
+// Thrown if a trace cannot be laid out: a length or tag is no number, types are nested too deeply,
+// or a field can have no column.
 struct LayoutError : std::invalid_argument {
   LayoutError(const std::string & reason, std::size_t number)
       : std::invalid_argument(reason), trace(number) {}
 
-  std::size_t trace;  // which of them
+  std::size_t trace;  // its number among the traces
 };
 
 // Lays out all streams and events of some traces. `wanted` are in order of the events. Throws
 // LayoutError.
 Layout lay_out(std::span<const TraceClass> traces, std::span<const WantedEvent> wanted);
 
-// Whether a field can have a column, and the bytes that a value takes there.
+// Returns the bytes that a value of a type takes in a column; none: it can have no column.
 std::optional<std::int64_t> column_width(const Kind & kind);
 
 }  // namespace chainshaper::ctf

@@ -1,8 +1,8 @@
 // Running the steps of a layout over the bits of a packet.
 //
-// Every step checks the end of the packet's content before it reads, and every load the bytes of
-// the file. Types of no bits and lengths from the packet could keep a core busy for hours: where
-// packets are looked at for the first time, what is done has to be paid from a budget.
+// Every step checks the end of the packet's content before it reads, and every load checks the end
+// of the file. Fields of no bits, whose number a packet says itself, could keep a core busy for
+// hours. So when packets are read for the first time, each step is paid from a budget.
 
 #pragma once
 
@@ -90,8 +90,8 @@ struct Row {
   Texts * texts;
 };
 
-// What may be spent for each byte of a packet, and in finding packets for each byte of a file. A
-// step costs 1, a byte of a column as well: fields of no bits could else fill the memory.
+// What may be spent for each byte of a packet or, in finding packets, for each byte of a file. A
+// step costs 1. A byte of a column costs 1 as well, or fields of no bits could fill the memory.
 inline constexpr std::int64_t budget_per_byte = 64;
 
 // Reads one packet after the other: the clock, the variables and the budget go on.

@@ -51,7 +51,7 @@ GateDescription chosen_gate(Choices & choose) {
   gate.into_open_slot = static_cast<Entry>(choose.below(2));
   if (choose.yes()) {
     gate.modes = {"city", "highway"};
-    gate.bands = {choose.place(2), 0};
+    gate.mode_slots = {choose.place(2), 0};
     gate.late = static_cast<Policy>(choose.below(4));
     described.modes = {0, 1};
   }

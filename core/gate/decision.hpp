@@ -61,7 +61,7 @@ inline Release release_of(const Gate & gate, std::int64_t arrival_ns, Maybe stam
   std::size_t last = gate.slots.size();
   if (!gate.modes.empty()) {
     mode = schedules.in_force(origin).mode.value_or(gate.first_mode);
-    first = gate.bands[*mode];
+    first = gate.mode_slots[*mode];
     if (gate.late != Policy::next_slot) last = first + 1;
   }
   const std::int64_t ready = std::max(arrival_ns, ready_ns);

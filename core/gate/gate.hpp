@@ -37,10 +37,10 @@ std::optional<std::size_t> place_of(const Words & words, const Word & word) {
 // The publish slots of one output. Its numbers and words are declared in chainshaper/robot/gate.py.
 struct Gate : GateValues {
   std::vector<Slot> slots;
-  std::vector<std::string> modes;  // their names; modes are numbered in this order
-  std::vector<std::size_t> bands;  // the place of each mode's slot
-  std::size_t first_mode{0};       // in force until a mode is announced
-  Policy late{Policy::wait};       // for messages behind their mode's slot
+  std::vector<std::string> modes;       // their names; modes are numbered in this order
+  std::vector<std::size_t> mode_slots;  // the place of each mode's slot
+  std::size_t first_mode{0};            // in force until a mode is announced
+  Policy late{Policy::wait};            // for messages behind their mode's slot
   std::size_t depth{schema::depth};
 
   bool may_move(std::int64_t by_ns) const {
@@ -69,7 +69,7 @@ struct Gate : GateValues {
 inline void check(const Gate & gate) {
   const auto & slots = gate.slots;
   bool sound = gate.cycle_ns > 0 && !slots.empty() && gate.due_cycles >= 0 && gate.depth > 0 &&
-               gate.bands.size() == gate.modes.size();
+               gate.mode_slots.size() == gate.modes.size();
   // Sums of a time and some cycles must not overflow.
   constexpr auto longest_ns = std::numeric_limits<std::int64_t>::max() / 4;
   sound = sound && gate.due_cycles <= longest_ns / gate.cycle_ns - schema::max_age_cycles - 1;
@@ -79,7 +79,7 @@ inline void check(const Gate & gate) {
     sound = sound && previous_end <= start && start < end && end <= gate.cycle_ns;
     previous_end = end;
   }
-  for (const auto band : gate.bands) sound = sound && band < slots.size();
+  for (const auto place : gate.mode_slots) sound = sound && place < slots.size();
   if (!sound) {
     throw std::invalid_argument(
         "a gate needs a cycle, slots in it that ascend and do not overlap, one of them for each "

@@ -24,9 +24,9 @@ struct Arrival {
 
 // A gate's decisions for one message after the other, and what it remembers between two of them.
 // `Queue` has the messages as well; in a simulation they stay in the history of their reader.
-class Turns {
+class Decisions {
 public:
-  explicit Turns(Gate served) : gate(std::move(served)), schedules(gate) { check(gate); }
+  explicit Decisions(Gate served) : gate(std::move(served)), schedules(gate) { check(gate); }
 
   // Decides when a message would leave, without regard to those before it.
   Release release_at(const Arrival & message, std::int64_t ready_ns) const {
@@ -123,9 +123,9 @@ struct Outcome {
 
 // The messages that wait at a gate, and its decisions about them.
 template <typename Message>
-class Queue : public Turns {
+class Queue : public Decisions {
 public:
-  explicit Queue(Gate served) : Turns(std::move(served)) {}
+  explicit Queue(Gate served) : Decisions(std::move(served)) {}
 
   // Uses no stamps until all messages under way have come: the wall clock was stepped.
   void doubt_stamps(std::int64_t now_ns) {
@@ -145,7 +145,7 @@ public:
     return Outcome<Message>{take_oldest(), release, arrival_ns};
   }
 
-  Release decide() { return Turns::decide(waiting.front()); }
+  Release decide() { return Decisions::decide(waiting.front()); }
 
   bool replaced(const Release & release, std::int64_t now_ns) const {
     return std::any_of(waiting.begin() + 1, waiting.end(),

@@ -5,13 +5,13 @@
 namespace chainshaper::matching {
 namespace {
 
-// What is known of a key while starts and ends are walked over in order of time.
+// The state of a key while the walk goes over starts and ends in order of time.
 struct Instance {
-  std::uint32_t start{no_row};  // the start whose end is looked for
-  std::uint32_t depth{0};       // starts without their ends
-  std::int64_t seen_ns{0};      // the moment of the latest event
-  bool seen{false};             // whether there was one
-  bool was_open{false};         // whether an instance was open before that moment
+  std::uint32_t start{no_row};  // the latest start, as long as it has no end
+  std::uint32_t depth{0};       // how many starts have no end yet
+  std::int64_t seen_ns{0};      // the time of the key's latest event
+  bool seen{false};             // whether the key had an event
+  bool was_open{false};         // whether an instance was open before that time
 };
 
 class PairWalk {
@@ -29,7 +29,7 @@ public:
         for (auto row = end; row < next_end; ++row)
           close(instance_of(ends_.keys, row, now_ns), row);
       } else {
-        // First the ends of what was open before this moment, then starts, then the other ends.
+        // First ends of instances that were open before this time, then starts, then other ends.
         close(end, next_end, now_ns, true);
         for (auto row = start; row < next_start; ++row) open(row, now_ns);
         close(end, next_end, now_ns, false);
@@ -41,12 +41,14 @@ public:
   }
 
 private:
+  // Returns the time of the next event, be it a start or an end.
   std::int64_t earlier(std::size_t start, std::size_t end) const {
     if (start == starts_.times_ns.size()) return ends_.times_ns[end];
     if (end == ends_.times_ns.size()) return starts_.times_ns[start];
     return std::min(starts_.times_ns[start], ends_.times_ns[end]);
   }
 
+  // Returns the first row, from `row` on, whose time is not `now_ns`.
   static std::size_t behind(std::span<const std::int64_t> times_ns, std::size_t row,
                             std::int64_t now_ns) {
     while (row < times_ns.size() && times_ns[row] == now_ns) ++row;
@@ -69,7 +71,8 @@ private:
     ++instance.depth;
   }
 
-  // Closes instances that were open before this moment, or those that were not.
+  // Ends instances of rows [row, behind_last): only those that were open before this time, or only
+  // the others.
   void close(std::size_t row, std::size_t behind_last, std::int64_t now_ns, bool open_before) {
     for (; row < behind_last; ++row) {
       Instance & instance = instance_of(ends_.keys, row, now_ns);
@@ -80,7 +83,7 @@ private:
   void close(Instance & instance, std::size_t row) {
     if (instance.start != no_row) rows_[instance.start] = static_cast<std::uint32_t>(row);
     instance.start = no_row;
-    if (instance.depth > 0) --instance.depth;  // else it is of an instance that began unrecorded
+    if (instance.depth > 0) --instance.depth;  // 0: the start was not recorded
   }
 
   const Events & starts_;
@@ -96,8 +99,8 @@ std::vector<std::uint32_t> nearest_rows(const Events & left, const Events & righ
   const auto lefts = left.times_ns.size(), rights = right.times_ns.size();
   const bool forward = direction == Direction::latest_before;
   std::vector<std::uint32_t> rows(lefts, no_row);
-  KeyTable<std::uint32_t> latest;  // the row of `right` with this key that was passed last
-  std::size_t passed = 0;          // so many rows of `right`, from its beginning or its end
+  KeyTable<std::uint32_t> latest;  // by key, the row of `right` that was passed last
+  std::size_t passed = 0;          // how many rows of `right`, from its beginning or its end
   for (std::size_t step = 0; step < lefts; ++step) {
     const auto row = forward ? step : lefts - 1 - step;
     const auto now_ns = left.times_ns[row];

@@ -1,4 +1,4 @@
-// Matching rows to rows by key and time. chainshaper/analysis/matching.py says what for.
+// Matching rows of two tables by key and time. chainshaper/analysis/matching.py uses it.
 
 #pragma once
 
@@ -21,16 +21,16 @@ struct Events {
 
 enum class Direction { latest_before, first_after };
 
-// For each row of `left` the row of `right` with the same key that is the latest one at or before
-// it (of equal times the last), or the first one at or after it (of equal times the first).
-// `strictly` leaves out rows at the very time of the left one.
+// Returns, for each row of `left`, a row of `right` with the same key: the latest row at or before
+// its time (of equal times the last), or the first row at or after it (of equal times the first).
+// With `strictly`, rows at exactly that time are left out.
 std::vector<std::uint32_t> nearest_rows(const Events & left, const Events & right,
                                         Direction direction, bool strictly);
 
-// For each start the end of the same key that is the next event of that key.
+// Returns, for each start, its end: the next event of the same key, if that is an end.
 //
-// An instance may begin in the nanosecond in which the one before ended (end first), or last no
-// time at all (start first): the former when one was open before that moment.
+// Where a start and an end of a key have the same time, the end comes first if an instance was open
+// before (it ends, and the next one begins), else the start (an instance that takes no time).
 std::vector<std::uint32_t> ends_of_starts(const Events & starts, const Events & ends);
 
 }  // namespace chainshaper::matching

@@ -1,4 +1,4 @@
-// Keys of rows, and a hash table from keys to what is known of them.
+// Keys of rows, and a hash table from keys to values.
 
 #pragma once
 
@@ -24,11 +24,11 @@ struct Key {
 
 inline constexpr std::size_t most_key_columns = 3;
 
-// The keys of a table's rows, read where their columns lie. Numbers are compared by their bits,
-// whatever their sign; those of 32 bits are extended by 0s.
+// The keys of a table's rows, which are read from its columns without copying these. Numbers are
+// compared by their bits, signed or not; numbers of 32 bits are extended by 0s.
 class Keys {
 public:
-  // Adds a column of 32 or 64 bits, of as many rows as the table has. At most three are added.
+  // Adds a column of 32 or 64 bits, with as many rows as the table. At most three can be added.
   template <typename Number>
   void add(std::span<const Number> rows) {
     static_assert(sizeof(Number) == 4 || sizeof(Number) == 8);
@@ -61,17 +61,17 @@ private:
   std::size_t count_{0};
 };
 
-// An open hash table that grows by itself and forgets nothing.
+// An open hash table that grows as needed; nothing can be removed.
 template <typename Value>
 class KeyTable {
 public:
-  // What is known of a key; nullptr where it was never added.
+  // Returns the value of a key; nullptr: it was never added.
   Value * find(Key key) {
     Place & place = place_of(key);
     return place.taken ? &place.value : nullptr;
   }
 
-  // The value of a key, a new one where the key was never added. Valid until the next call.
+  // Returns the value of a key, which is added if it was not before. Valid until the next call.
   Value & operator[](Key key) {
     Place * place = &place_of(key);
     if (!place->taken) {
@@ -98,7 +98,7 @@ private:
     return static_cast<std::size_t>(mixed >> 17);
   }
 
-  // Where a key is, or else the free place where it would be; there always is a free one.
+  // Returns the place of a key, or the free place where it would be; there always is a free one.
   Place & place_of(Key key) {
     const auto mask = places_.size() - 1;
     auto index = hash(key) & mask;

@@ -13,13 +13,15 @@ namespace chainshaper::simulation {
 
 struct Thread;
 
-// A timer expires, a message reaches its reader's process, or a sleep is over.
+// A timer expires.
 struct Expiry {
   Entity * timer;
 };
+// A message reaches its reader's process.
 struct Delivery {
   Message * message;
 };
+// A thread has slept for as long as it wanted.
 struct SleepOver {
   Thread * thread;
 };

@@ -6,8 +6,8 @@
 namespace chainshaper::simulation {
 namespace {
 
-void require(bool sound, const char * what) {
-  if (!sound) throw std::invalid_argument(std::string("a simulation cannot have ") + what);
+void require(bool sound, const char * problem) {
+  if (!sound) throw std::invalid_argument(std::string("a simulation cannot have ") + problem);
 }
 
 // A sum of a few times of this size can be held.

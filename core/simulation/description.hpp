@@ -1,8 +1,8 @@
 // What is simulated: an application's processes, threads, callbacks and topics, as plain values.
 //
 // Parts refer to each other by their places in the lists of a `Description`. Python fills it in
-// (chainshaper/simulation/machine.py) and `check` refuses one that makes no sense. All times are
-// nanoseconds of the one clock that a simulated machine has.
+// (chainshaper/simulation/machine.py) and `check` refuses a contradictory one. All times are
+// nanoseconds of the only clock that a simulated machine has.
 
 #pragma once
 
@@ -32,12 +32,12 @@ struct OpenServers {
 struct CoreDescription {
   std::vector<OpenServers> table;    // in force again and again; empty: no plan governs this core
   std::uint64_t open_servers{0};     // at the start
-  Place next{0};                     // the row of the table that comes into force next,
-  Nanoseconds boundary_ns{forever};  // then
+  Place next{0};                     // the row of the table that comes into force next
+  Nanoseconds boundary_ns{forever};  // when it does
 };
 
-// Who works in a thread: an executor's callbacks, the asynchronous publishers of its process, or
-// DDS on what the process receives.
+// What a thread does: it runs an executor's callbacks, sends for the asynchronous publishers of its
+// process, or receives messages for DDS.
 enum class Role { executor, publisher, dds };
 
 struct ThreadDescription {
@@ -46,17 +46,20 @@ struct ThreadDescription {
   std::optional<std::size_t> server;  // of its core; none: it runs at any time
   Role role{Role::executor};
   Place process{0};
-  Place wake_up{0};     // streams of CPU times (ns): from being woken to being at work,
-  Place take{0};        // from choosing a message to its callback,
-  Place publish{0};     // of a publication, or of sending one;
-  MaybePlace receive;   // of a message received: threads of DDS have it.
-  Place delivery{0};    // Until a message is at the subscriber's process.
-  std::int32_t pid{0};  // what events say of the thread
+  // Streams of CPU times:
+  Place wake_up{0};    // from being woken to being at work
+  Place take{0};       // from choosing a message to the beginning of its callback
+  Place publish{0};    // of publishing a message, or of sending it
+  MaybePlace receive;  // of receiving a message; threads of DDS have it
+  // Stream of delays:
+  Place delivery{0};  // from sending a message until it is at the subscriber's process
+  // In its events:
+  std::int32_t pid{0};
   std::int32_t tid{0};
   std::int32_t cpu{0};
 };
 
-// In which order the executor of a process does what is ready: engine.hpp says what each does.
+// The order in which the executor of a process runs callbacks; see engine.hpp.
 enum class ExecutorKind { single_threaded, static_single_threaded, events, multi_threaded };
 
 struct ProcessDescription {
@@ -72,25 +75,26 @@ enum class EntityKind { timer, subscription, service, client };
 enum class Body { compute, gate, mode_listener, synchronise };
 
 struct EntityDescription {
-  std::int64_t callback{0};  // handles, as events have them
+  // Handles, as events have them:
+  std::int64_t callback{0};
   std::int64_t handle{0};
   std::int64_t rmw_handle{0};
   Place process{0};
   EntityKind kind{EntityKind::subscription};
   MaybePlace group;  // mutually exclusive callback group; none: it may always run
   Body body{Body::compute};
-  Place gate{0};          // of a gate, or of a listener for its modes
-  Place synchroniser{0};  // of an input of one, which is its
-  Place input{0};
-  Nanoseconds period_ns{1};  // of timers,
-  Nanoseconds due_ns{0};     // whose first expiry this is
-  Place execution{0};        // streams of CPU times: of the callback up to its publications
-  MaybePlace afterwards;     // and behind them; none: it ends with its last publication
-  Place first_publisher{0};  // it publishes with these, in their order
+  Place gate{0};             // if it is a gate, or listens for the modes of one
+  Place synchroniser{0};     // if it is an input of one
+  Place input{0};            // which input of the synchroniser it is
+  Nanoseconds period_ns{1};  // of a timer
+  Nanoseconds due_ns{0};     // when a timer expires first
+  Place execution{0};        // stream of CPU times of the callback before it publishes
+  MaybePlace afterwards;     // the same after it has published; none: it ends then
+  Place first_publisher{0};  // it publishes with these publishers, in their order
   Place publisher_count{0};
-  std::optional<Nanoseconds> lifespan_ns;  // messages that have waited for longer are gone
+  std::optional<Nanoseconds> lifespan_ns;  // a message that has waited for longer is dropped
   std::size_t depth{1};                    // messages in the history of its reader
-  bool starts_chain{false};                // each instance of its callback begins one of the chain
+  bool starts_chain{false};                // an instance of its callback begins one of the chain
   bool on_chain{false};                    // messages that it takes stay on the chain
 };
 
@@ -113,14 +117,15 @@ struct PublisherDescription {
 struct GateDescription {
   Gate gate;
   std::vector<std::int64_t> modes;  // the number of each of the gate's modes in the application
-  // From when on slots are moved from where the gate has them, and by how much.
+  // Shifts of all slots against the gate's: the time from which each holds, and how far it is.
   std::vector<std::pair<Nanoseconds, Nanoseconds>> moves;
-  Nanoseconds spin_ns{0};   // it watches the clock for so long before a release
-  Nanoseconds pause_ns{0};  // and rests for so long behind a publication
+  Nanoseconds spin_ns{0};   // for how long it watches the clock before a release
+  Nanoseconds pause_ns{0};  // for how long it rests after a publication
 };
 
-// Inputs come together: a set has a message of each. It is complete when the last one comes; with a
-// `trigger`, at each message of that input, with the newest ones of the others.
+// A synchroniser makes sets of messages, one of each input. A set is complete when its last message
+// comes. With a `trigger`, each message of that input completes a set, with the newest messages of
+// all other inputs.
 struct SynchroniserDescription {
   struct Input {
     bool on_chain{false};
@@ -145,22 +150,22 @@ struct Description {
   std::vector<SynchroniserDescription> synchronisers;
   std::vector<StreamDescription> streams;
   std::size_t groups{0};
-  Nanoseconds cycle_ns{0};           // of the plan in force; 0: none is
-  Nanoseconds quantum_ns{forever};   // equals take turns after so long; forever: they do not
-  Nanoseconds context_switch_ns{0};  // CPU time that it costs the thread switched to
-  Nanoseconds preemption_ns{0};      // and the thread that is resumed
-  std::int64_t interrupts_ppm{0};    // callbacks take so much longer because of interrupts
+  Nanoseconds cycle_ns{0};           // of the plan in force; 0: no plan is
+  Nanoseconds quantum_ns{forever};   // how long a turn takes; `forever`: equals take no turns
+  Nanoseconds context_switch_ns{0};  // CPU time that switching costs the thread switched to
+  Nanoseconds preemption_ns{0};      // CPU time that resuming costs a thread that was pre-empted
+  std::int64_t interrupts_ppm{0};    // by how much interrupts make callbacks longer
   Nanoseconds last_timer_ns{0};      // timers expire until then
   Nanoseconds stop_ns{0};
   Nanoseconds record_from_ns{0};    // events and instances of the chain count from then on
-  bool events{true};                // they are logged
-  bool switches{false};             // and so is every context switch
-  std::size_t instances{0};         // the latencies of so many instances of the chain are kept
-  std::size_t log_rows{131'072};    // the engine pauses when it has so many entries of a kind
-  std::size_t most_messages{4096};  // more under way: messages pile up without end
+  bool events{true};                // whether events are logged
+  bool switches{false};             // whether context switches are logged
+  std::size_t instances{0};         // of how many instances of the chain latencies are kept
+  std::size_t log_rows{131'072};    // the engine pauses when the log has so many rows of a kind
+  std::size_t most_messages{4096};  // if more are under way, messages pile up without end
 };
 
-// Throws std::invalid_argument where a place is not in its list or a number makes no sense.
+// Throws std::invalid_argument if a place is not in its list, or a number is not possible.
 void check(const Description & description);
 
 }  // namespace chainshaper::simulation

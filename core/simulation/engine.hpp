@@ -1,26 +1,32 @@
 // The discrete-event engine: ROS 2's executors, cores that run threads, and the order of events.
 //
-// On every core the eligible runnable thread of the smallest rank runs; among equals the one that
-// waits for longest, and a pre-empted thread stays in its place (SCHED_FIFO). Where a plan is in
-// force, threads in servers are eligible while a slot of their server is open, ranked by the
-// priority of the server; where the plan says so, equals take turns when their quantum is used up
-// (round-robin). All others come behind them, by their own priority (best effort).
+// On every core the eligible, runnable thread of the smallest rank runs; among threads of equal
+// rank, the one that has waited for longest. A pre-empted thread keeps its place (SCHED_FIFO).
+// Where a plan is in force, a thread in a server is eligible while a slot of the server is open,
+// and has the server's priority as its rank; where the plan says so, threads of equal rank take
+// turns of a quantum (round-robin). Threads outside servers come behind these, by their own
+// priority (best effort).
 //
-// At one instant, first what was to come happens (expiries, deliveries, ends of sleeps), so that an
-// executor's snapshot has all that happened up to that instant; then running threads that have used
-// what they needed go on; and only then slots open and close: work that fills a slot exactly is
-// done.
+// At an instant, three things happen in this order:
 //
-// Executors. Single-threaded (rclcpp/src/rclcpp/executor.cpp) and multi-threaded
-// (multi_threaded_executor.cpp) ones are as chainshaper/workload/executor.py has them, with
-// services and clients behind subscriptions. Static ones (static_single_threaded_executor.cpp):
-// subscriptions first, then timers, clients and services, and one callback per wait set. Events
-// executors (events_executor.cpp): in the order in which things happened, every message and every
-// expiry an event of its own. Entities stand in the order in which their executor looks at them.
+// 1. Timers expire, messages arrive, sleeps end. So an executor's snapshot has all that happened up
+//    to the instant.
+// 2. Running threads that have used the CPU time they needed go on.
+// 3. Slots open and close. So work that fills a slot exactly is done within it.
 //
-// A publication reaches every reader of its topic after a delay, in order, where a DDS thread of
-// the reader's process may have to work for it first. An asynchronous publisher hands it to the
-// publisher thread of its process before.
+// Executors. Entities are in the order in which their executor looks at them:
+//
+// * Single-threaded (rclcpp/src/rclcpp/executor.cpp) and multi-threaded ones
+//   (multi_threaded_executor.cpp) work as chainshaper/workload/executor.py says, with services and
+//   clients behind subscriptions.
+// * Static ones (static_single_threaded_executor.cpp) look at subscriptions first, then at timers,
+//   clients and services, and run one callback for each wait set.
+// * Events executors (events_executor.cpp) run callbacks in the order in which messages came and
+//   timers expired; each of these is an event.
+//
+// A message reaches every reader of its topic after a delay, in order. A DDS thread of the reader's
+// process may have to work for it first. An asynchronous publisher first hands it to the publisher
+// thread of its process.
 
 #pragma once
 
@@ -40,34 +46,34 @@
 
 namespace chainshaper::simulation {
 
-// Why the engine was left.
+// Why `Engine::run` has returned.
 enum class Pause {
-  none,           // so many instants have passed: the caller may do something else
-  log_full,       // the caller takes the log
-  messages_full,  // messages pile up without end: it cannot go on
-  endless,        // callbacks have each other called without time passing: it cannot go on
-  over,
+  none,           // the number of instants that was asked for has passed
+  log_full,       // the caller has to take the log
+  messages_full,  // messages pile up without end, so the simulation cannot go on
+  endless,        // callbacks cause each other without time passing, so it cannot go on
+  over,           // the end has come
 };
 
 class Engine {
 public:
-  // Throws std::invalid_argument for a description that makes no sense. `source` is asked for
-  // numbers while the engine runs.
+  // Throws std::invalid_argument for a contradictory description. `source` is asked for numbers
+  // while the engine runs.
   Engine(Description description, Source source);
 
   Engine(const Engine &) = delete;
   Engine & operator=(const Engine &) = delete;
 
-  // Goes on until the end, or until the caller has to do something, or for so many instants.
+  // Goes on until the end, until the caller has to do something, or for `most_instants`.
   Pause run(std::uint64_t most_instants);
 
   Nanoseconds now() const { return now_; }
   const Description & description() const { return given_; }
 
-  // What was logged since it was taken last.
+  // Returns and empties the log.
   std::vector<EntryColumns> take_log() { return log_.take_all(); }
 
-  // The latency of each instance of the chain that has started; `absent`: it did not complete.
+  // Returns the latency of each started instance of the chain; `absent`: it did not complete.
   std::vector<Nanoseconds> latencies() const;
 
 private:
@@ -101,8 +107,8 @@ private:
   bool take_message(Thread & thread, Entity & entity);
   void wake_owner(const Executor & executor);
 
-  // callbacks.cpp: what callbacks do. They leave in their thread how much CPU time it needs next
-  // and what follows, or let it wait; and return whether the callback goes on.
+  // callbacks.cpp: what callbacks do. These functions set the CPU time that their thread needs next
+  // and the step that follows, or let the thread wait. They return whether the callback goes on.
   bool begin_body(Thread & thread);
   bool go_on_publishing(Thread & thread);
   bool end(Thread & thread);
@@ -150,18 +156,18 @@ private:
   std::vector<Stream> streams_;
   std::vector<Core> cores_;
   std::vector<Thread> threads_;
-  std::vector<Executor> executors_;  // one of each process
+  std::vector<Executor> executors_;  // of the processes
   std::vector<Entity> entities_;
   std::vector<Publisher> publishers_;
   std::deque<GateAtWork> gates_;
   std::vector<Synchroniser> synchronisers_;
-  std::deque<bool> groups_;  // which are busy
+  std::deque<bool> groups_;  // whether each callback group is busy
 
   Nanoseconds now_{0};
   std::uint64_t next_sequence_{0};
   Agenda agenda_;
   MessagePool messages_;
-  std::size_t marks_{0};  // events of executors, and what waits for publisher threads
+  std::size_t marks_{0};  // entries in Executor::events and Thread::to_send of all
   EventLog log_;
   Pause pause_{Pause::none};
   std::uint64_t steps_{0};  // of threads and of the engine, at the present instant
@@ -169,7 +175,7 @@ private:
   std::size_t started_{0};  // recorded instances of the chain
 };
 
-// A time and a duration, which may be any: no later than `forever`.
+// Returns a time plus a duration, or `forever` if that is less.
 inline Nanoseconds later(Nanoseconds time, Nanoseconds duration) {
   return duration >= forever - time ? forever : time + duration;
 }

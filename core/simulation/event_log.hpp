@@ -1,7 +1,7 @@
 // The log of events, as columns of numbers: an entry for each trace point that a process passes.
 //
-// Entries and fields have the names of chainshaper/workload/event_log.py, as have those of live
-// runs.
+// Entries and fields have the same names as in logs of live runs
+// (chainshaper/workload/event_log.py).
 
 #pragma once
 
@@ -38,7 +38,7 @@ struct EntryNames {
 // The names of all entries, in the order of `TracePoint`.
 const std::vector<EntryNames> & log_layout();
 
-// Numbers that are Python's later on, without being copied.
+// Numbers that are given to Python later on, without being copied.
 template <typename Number>
 using Column = std::unique_ptr<Number[]>;
 
@@ -79,7 +79,7 @@ private:
   std::vector<EntryColumns> entries_;
 };
 
-// Outcomes of an asynchronous publication, as `WORDS["outcome"]` there numbers them.
-enum class Outcome : std::int64_t { sent, expired, overwritten };
+// Outcomes of an asynchronous publication, in the order of `WORDS["outcome"]` in event_log.py.
+enum class SendOutcome : std::int64_t { sent, expired, overwritten };
 
 }  // namespace chainshaper::simulation

@@ -15,10 +15,10 @@ std::int64_t number_of(const std::optional<Number> & value) {
 bool Engine::enter_gate(Thread & thread) {
   GateAtWork & gate = *thread.entity->gate;
   // A gate at rest knows of a message when it has taken it.
-  const bool rested = thread.carried.arrival >= gate.turns.free_ns;
+  const bool rested = thread.carried.arrival >= gate.decisions.free_ns;
   gate.arrival = rested ? now_ : thread.carried.arrival;
-  const Nanoseconds phase = gate.turns.see_phase(gate.arrival, thread.carried.origin);
-  gate.release = gate.turns.decide({gate.arrival, thread.carried.origin, phase});
+  const Nanoseconds phase = gate.decisions.see_phase(gate.arrival, thread.carried.origin);
+  gate.release = gate.decisions.decide({gate.arrival, thread.carried.origin, phase});
   thread.began = now_;
   if (!gate.release.at_ns) return leave_gate(thread);
   thread.step = Step::gate_wake;
@@ -53,12 +53,13 @@ bool Engine::pass_gate(Thread & thread) {
 bool Engine::publish_from_gate(Thread & thread) {
   GateAtWork & gate = *thread.entity->gate;
   thread.began = now_;
-  if (gate.turns.gate.policy() == Policy::discard && missed(gate.turns.gate, gate.release, now_)) {
+  if (gate.decisions.gate.policy() == Policy::discard &&
+      missed(gate.decisions.gate, gate.release, now_)) {
     gate.release.drop(Dropped::discarded);
     gate.release.overrun = Policy::discard;
     return leave_gate(thread);
   }
-  gate.turns.left(gate.release);
+  gate.decisions.left(gate.release);
   thread.step = Step::gate_published;
   publish(thread, thread.entity->publishers.front());
   thread.left = draw(*thread.publish);
@@ -76,8 +77,8 @@ void Engine::look_at_waiting(const Entity & entity) {
   if (entity.history.size() == 0) return;
   for (const Message * newer = &entity.history.oldest(); newer != nullptr; newer = newer->next) {
     const Nanoseconds arrival = newer->carried.arrival;
-    const Nanoseconds phase = gate.turns.schedules.in_force(arrival).phase_ns;
-    if (gate.turns.is_replaced(gate.release, {arrival, newer->carried.origin, phase}, now_)) {
+    const Nanoseconds phase = gate.decisions.schedules.in_force(arrival).phase_ns;
+    if (gate.decisions.is_replaced(gate.release, {arrival, newer->carried.origin, phase}, now_)) {
       gate.release.drop(Dropped::replaced);
       return;
     }
@@ -86,7 +87,7 @@ void Engine::look_at_waiting(const Entity & entity) {
 
 bool Engine::leave_gate(Thread & thread) {
   GateAtWork & gate = *thread.entity->gate;
-  gate.turns.free_ns = now_;
+  gate.decisions.free_ns = now_;
   log_release(*thread.entity, thread.began.value_or(now_), thread, thread.carried.source,
               gate.arrival, gate.release);
   return end(thread);
@@ -95,8 +96,8 @@ bool Engine::leave_gate(Thread & thread) {
 // Logs the oldest message of a full history as overflowed.
 void Engine::overflow(Entity & entity) {
   const Carried & oldest = entity.history.oldest().carried;
-  const Nanoseconds phase = entity.gate->turns.schedules.in_force(oldest.arrival).phase_ns;
-  Release release = entity.gate->turns.release_at({oldest.arrival, oldest.origin, phase}, now_);
+  const Nanoseconds phase = entity.gate->decisions.schedules.in_force(oldest.arrival).phase_ns;
+  Release release = entity.gate->decisions.release_at({oldest.arrival, oldest.origin, phase}, now_);
   release.drop(Dropped::overflowed);
   log_release(entity, now_, *entity.executor->threads.front(), oldest.source, oldest.arrival,
               release);
@@ -114,7 +115,7 @@ void Engine::log_release(const Entity & entity, Nanoseconds time, const Thread &
 // Tells a gate the application's mode; a mode that the gate does not know changes nothing.
 void Engine::announce(GateAtWork & gate, std::optional<std::int64_t> mode) const {
   if (!mode) return;
-  if (const auto known = place_of(gate.modes, *mode)) gate.turns.switch_mode(*known, now_);
+  if (const auto known = place_of(gate.modes, *mode)) gate.decisions.switch_mode(*known, now_);
 }
 
 }  // namespace chainshaper::simulation

@@ -21,19 +21,19 @@ struct Carried {
   std::optional<Nanoseconds> chain_start;  // when its chain began; none: it is not on the chain
   std::size_t instance{0};                 // of the chain, counted from 0
   std::optional<std::int64_t> mode;        // that it announces
-  Nanoseconds arrival{0};                  // in the history of its reader
+  Nanoseconds arrival{0};                  // when it came into the history of its reader
 };
 
 struct Message {
-  Message * next{nullptr};  // behind it in its queue, or unused as well
+  Message * next{nullptr};  // the next one in its queue, or among the unused ones
   Entity * entity{nullptr};
   Publisher * publisher{nullptr};
   std::int64_t address{0};
   Carried carried;
 };
 
-// Owns all messages. A message that is given back is handed out again, so that a long run allocates
-// no more than the most messages that were under way at once.
+// Owns all messages. Messages that are given back are used again, so a long run allocates only as
+// many as were ever under way at once.
 class MessagePool {
 public:
   Message & take() {
@@ -53,7 +53,7 @@ public:
   std::size_t in_use() const { return in_use_; }
 
 private:
-  std::deque<Message> messages_;  // which never moves them
+  std::deque<Message> messages_;  // a deque, which never moves them
   Message * unused_{nullptr};
   std::size_t in_use_{0};
 };

@@ -1,6 +1,7 @@
 // What changes while an application is simulated: cores, threads, executors, callbacks, topics.
 //
-// Each has its part of the description, and points to what it works with. None of them moves.
+// Each points to its part of the description, and to the others that it works with. None is moved
+// in memory.
 
 #pragma once
 
@@ -30,37 +31,40 @@ struct Core {
   std::vector<Thread *> threads;
   std::vector<OpenServers> table;
   std::uint64_t open_servers;
-  Place next;            // the row of the table that comes into force
-  Nanoseconds boundary;  // then
+  Place next;            // the row of the table that comes into force next
+  Nanoseconds boundary;  // when it does
   Thread * running{nullptr};
-  Thread * ran_last{nullptr};  // before it idled, perhaps
-  Nanoseconds since{0};        // what the running thread has used up to then is accounted for
-  Nanoseconds until{forever};  // then the running thread has to be looked at
-  Nanoseconds quantum{0};      // what is left of its turn
-  bool changed{true};          // another thread may have to run
+  Thread * ran_last{nullptr};  // the thread that ran last, also while the core is idle
+  Nanoseconds since{0};        // the CPU time of the running thread is counted up to this time
+  Nanoseconds until{forever};  // when the running thread has to be looked at
+  Nanoseconds quantum{0};      // what is left of the running thread's turn
+  bool changed{true};          // whether another thread may have to run
 };
 
 // What a thread does next, when it has used the CPU time that is left to it.
 enum class Step {
-  collect,  // an executor: look for what is ready,
-  turn,     // after it has waited for other threads of its executor;
-  take,     // take what was chosen and begin its callback,
-  publish,  // publish, or end the callback;
+  // Of an executor's thread:
+  collect,  // look for what is ready
+  turn,     // execute what is next, after waiting for other threads of the executor
+  take,     // take the message of the chosen entity and begin its callback
+  publish,  // publish, or end the callback
   gate_wake,
   gate_published,
   gate_paused,
-  send,  // a publisher thread
+  // Of a publisher thread:
+  send,
   sent,
-  receive,  // a thread of DDS
+  // Of a thread of DDS:
+  receive,
   received,
 };
 
 struct Thread {
-  std::int64_t rank;     // the smaller one runs
-  std::uint64_t server;  // its bit among those that are open; 0: it runs at any time
+  std::int64_t rank;     // the thread with the smallest runs
+  std::uint64_t server;  // the bit of its server in Core::open_servers; 0: it runs at any time
   std::int32_t place;    // in the list of threads
   Core * core;
-  Executor * executor;  // of its process, also where others than callbacks run in it
+  Executor * executor;  // of its process, also if it runs no callbacks
   Stream * wake_up;
   Stream * take;
   Stream * publish;
@@ -70,16 +74,16 @@ struct Thread {
 
   bool runnable{false};
   bool preempted{false};
-  Nanoseconds left{0};           // CPU time to the next step
-  Nanoseconds used{0};           // CPU time so far
-  std::uint64_t sequence{0};     // the smaller one goes first among those of its rank
-  Entity * entity{nullptr};      // whose callback runs
-  std::size_t publication{0};    // how many of its publishers have published; one more: all is done
-  Publisher * sending{nullptr};  // of a publisher thread
+  Nanoseconds left{0};               // CPU time to the next step
+  Nanoseconds used{0};               // CPU time so far
+  std::uint64_t sequence{0};         // of the threads of a rank, the one with the smallest runs
+  Entity * entity{nullptr};          // the entity whose callback it runs
+  std::size_t publication{0};        // how many of the entity's publishers have published
+  Publisher * sending{nullptr};      // of a publisher thread
   std::deque<Publisher *> to_send;   // of a publisher thread
   MessageQueue to_receive;           // of a thread of DDS
-  Carried carried;                   // by its present message
-  std::optional<Nanoseconds> began;  // sending, or the gate woke
+  Carried carried;                   // what its present message carries
+  std::optional<Nanoseconds> began;  // when it began to send, or its gate woke up
 };
 
 struct Executor {
@@ -88,26 +92,26 @@ struct Executor {
   std::vector<Thread *> threads;
   Thread * publisher_thread{nullptr};  // none: nothing is published asynchronously
   Thread * dds_thread{nullptr};        // none: receiving takes no CPU time
-  Thread * owner{nullptr};             // waits, or takes what is next; none: all execute
-  std::deque<Entity *> events;         // of an events executor, in the order of happening
+  Thread * owner{nullptr};             // the thread that waits or chooses; none: all run callbacks
+  std::deque<Entity *> events;         // of an events executor: the entities to run, in order
 };
 
 // A gate in a callback: its messages wait in the history of its reader.
 struct GateAtWork {
   explicit GateAtWork(const GateDescription & described)
-      : turns(described.gate),
+      : decisions(described.gate),
         modes(described.modes),
         spin(described.spin_ns),
         pause(described.pause_ns) {
-    for (const auto & [from_ns, by_ns] : described.moves) turns.move_slots(by_ns, from_ns);
+    for (const auto & [from_ns, by_ns] : described.moves) decisions.move_slots(by_ns, from_ns);
   }
 
-  Turns turns;
-  std::vector<std::int64_t> modes;  // the number of each in the application
+  Decisions decisions;
+  std::vector<std::int64_t> modes;  // the application's number of each of the gate's modes
   Nanoseconds spin;
   Nanoseconds pause;
   Nanoseconds arrival{0};  // of the message that it holds
-  Release release{};       // what was decided about it
+  Release release{};       // the decision about that message
 };
 
 struct Synchroniser {
@@ -123,7 +127,7 @@ struct Synchroniser {
 struct Entity {
   const EntityDescription * given;
   Executor * executor;
-  bool * group_is_busy;  // none: it may always run
+  bool * group_is_busy;  // whether its callback group is; none: it may always run
   Stream * execution;
   Stream * afterwards;
   std::span<Publisher> publishers;
@@ -139,15 +143,15 @@ struct Entity {
 
 struct ReaderOf {
   Entity * entity;
-  Stream * delivery;            // none: that of the sending thread
-  Nanoseconds last_arrival{0};  // DDS delivers what comes from one publisher in order
+  Stream * delivery;            // none: it is the sending thread's
+  Nanoseconds last_arrival{0};  // DDS delivers the messages of a publisher in order
 };
 
 struct Publisher {
   const PublisherDescription * given;
   std::int64_t place;  // in the list of publishers
   std::vector<ReaderOf> readers;
-  MessageQueue history;  // what waits for the publisher thread
+  MessageQueue history;  // messages that wait for the publisher thread
   std::uint64_t published{0};
 };
 

@@ -14,7 +14,7 @@
 
 namespace chainshaper::simulation {
 
-// Gives the next block of numbers of the stream at a place. An exception ends the simulation.
+// Returns the next block of numbers of the stream at a place. An exception ends the simulation.
 using Source = std::function<std::vector<Nanoseconds>(Place)>;
 
 class Stream {

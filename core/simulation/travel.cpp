@@ -44,10 +44,10 @@ void Engine::hand_over(Thread & sender, Publisher & publisher, Message & message
     sender.to_send.push_back(&publisher);
     ++marks_;
     count_in_use();
-  } else {  // the newer ones move up by one place
+  } else {  // the oldest is lost; `to_send` has an entry for it, which the newer ones use
     log(TracePoint::send, now_, &sender,
         {publisher.given->rmw_handle, publisher.history.oldest().carried.source,
-         static_cast<std::int64_t>(Outcome::overwritten), 0});
+         static_cast<std::int64_t>(SendOutcome::overwritten), 0});
   }
   put_newest(publisher.history, publisher.given->depth, message);
   wake(sender, Step::send);
@@ -109,7 +109,7 @@ void Engine::work_for_executor(Thread & thread) {
       const Nanoseconds began = thread.began.value_or(now_);
       log(TracePoint::send, began, &thread,
           {thread.sending->given->rmw_handle, thread.carried.source,
-           static_cast<std::int64_t>(Outcome::sent), now_ - began});
+           static_cast<std::int64_t>(SendOutcome::sent), now_ - began});
       thread.step = Step::send;
       break;
     }
@@ -137,7 +137,7 @@ void Engine::send_next(Thread & thread) {
   const auto & lifespan = publisher.given->lifespan_ns;
   if (lifespan && now_ - source > *lifespan) {
     log(TracePoint::send, now_, &thread,
-        {publisher.given->rmw_handle, source, static_cast<std::int64_t>(Outcome::expired), 0});
+        {publisher.given->rmw_handle, source, static_cast<std::int64_t>(SendOutcome::expired), 0});
     messages_.give_back(message);
     return;
   }

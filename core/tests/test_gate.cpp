@@ -45,7 +45,7 @@ void slots_count_from_the_phase_where_a_stamp_is_of_no_use() {
 void each_mode_has_its_slot() {
   Gate gate = gate_with({{20, 21}, {60, 61}}, 100);
   gate.modes = {"city", "highway"};
-  gate.bands = {1, 0};
+  gate.mode_slots = {1, 0};
   gate.late = Policy::next_slot;
   EXPECT(release_of(gate, 1110, 1100, switched_at(gate, 1050), 1110, 0).at_ns == 1120);
   EXPECT(release_of(gate, 1110, 1100, switched_at(gate, 1150), 1110, 0).at_ns == 1160);

@@ -525,7 +525,7 @@ class GateDescription:
     overrun: str
     due_cycles: int
     mode_names: list[str]
-    bands: list[int]
+    mode_slots: list[int]
     first_mode: int
     late: str
     messages: str
@@ -545,7 +545,7 @@ class GateDescription:
         overrun: str = ...,
         due_cycles: int = ...,
         mode_names: Sequence[str] = ...,
-        bands: Sequence[int] = ...,
+        mode_slots: Sequence[int] = ...,
         first_mode: int = ...,
         late: str = ...,
         messages: str = ...,

@@ -6,7 +6,7 @@ from story import Story
 from test_traversals import spans, traversals
 
 from chainshaper.analysis import data_flow, executors
-from chainshaper.flow.plan import _instances_apart_from
+from chainshaper.flow.recorded_profile.times import undisturbed_instances
 
 
 def latencies(story: Story, spec: str) -> list[tuple[int, int | None]]:
@@ -109,7 +109,7 @@ def test_what_a_timer_in_python_publishes_is_not_what_its_thread_took_before() -
     assert timer.rows() == [("/python", 100, False)]
     # Of which a plan is made: 5 of the timer's, 10 of the subscription's.
     none = pl.DataFrame(schema={"start": pl.Int64(), "end": pl.Int64()})
-    assert _instances_apart_from(flow, none)["response"].to_list() == [5, 10] * 4
+    assert undisturbed_instances(flow, none)["response"].to_list() == [5, 10] * 4
 
 
 def test_without_calls_of_timers_a_topic_that_came_before_all_takes_is_no_output_of_one() -> None:

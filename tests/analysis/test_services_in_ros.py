@@ -107,6 +107,7 @@ def test_the_commands_show_services_and_clients(recording: Path) -> None:
 
 @pytest.mark.ros2
 @pytest.mark.timeout(300)
+@pytest.mark.usefixtures("lttng_of_ros2")
 def test_lttng_has_no_calls_before_kilted_and_latency_says_so(tmp_path: Path) -> None:
     environment = ros2_environment()
     if environment["ROS_DISTRO"] not in ("humble", "jazzy"):

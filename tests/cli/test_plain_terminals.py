@@ -95,3 +95,18 @@ def test_a_signal_at_any_instant_ends_a_verb_without_a_traceback(
         endings = (0, 2, 130, -number, -signal.SIGINT)
         assert process.returncode in endings, (words, part, said)
         (tmp_path / "page.html").unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_the_interpreter_ends_leaves_no_traceback(number: signal.Signals) -> None:
+    """Libraries have functions of theirs called then."""
+    program = (
+        "import atexit, os, sys\n"
+        "import chainshaper.__main__ as entry\n"
+        f"atexit.register(os.kill, os.getpid(), {int(number)})\n"
+        "sys.argv = ['chainshaper', '--version']\n"
+        "entry.main()\n"
+    )
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
+    assert (run.returncode, run.stderr) == (-number, b"")
+    assert run.stdout.startswith(b"chainshaper "), "it was done"

@@ -52,6 +52,7 @@ from chainshaper.enforcement.journal import all_runs_locked, journals_folder
 from chainshaper.linux import cgroups
 from chainshaper.linux.threads import list_threads, parents
 from chainshaper.planning import ChainPlan, Plan, plan_shaping, save_plan
+from chainshaper.robot.handover import page_folders
 
 pytestmark = [pytest.mark.timed, needs_fifo, needs_cgroups]
 FIFO = ("--backend", "fifo")
@@ -96,8 +97,9 @@ def test_a_node_runs_inside_its_slots_and_is_as_before_afterwards(tmp_path: Path
 
 def test_a_command_is_started_governed_and_ended(tmp_path: Path) -> None:
     output = tmp_path / "windows"
-    talking = ("sh", "-c", 'echo so says the command; exec "$@"', "sh")
-    command = [*talking, *node_command("origin", output)]
+    page = "from chainshaper.robot.handover import open_page; open_page('of_a_command', '/out')"
+    shaping = 'echo so says the command; "$0" -c "$1"; shift; exec "$@"'
+    command = ["sh", "-c", shaping, sys.executable, page, *node_command("origin", output)]
     with applied(one_server_plan(), tmp_path, *FIFO, "--json", "--", *command) as run:
         threads = [t for p in _processes_of(str(output)) for t in list_threads(p)]
         assert "SCHED_FIFO" in [t.policy for t in threads]
@@ -106,6 +108,8 @@ def test_a_command_is_started_governed_and_ended(tmp_path: Path) -> None:
         assert run.returncode == 0
     assert not _processes_of(str(NODE))
     assert json.loads(stdout)["command"] == command, "what the command says goes elsewhere"
+    pages = [page for folder in page_folders() for page in Path(folder).glob("of_a_command.*")]
+    assert not pages, "of outputs that it shaped"
 
 
 KILLED = ("sh", "-c", "kill -9 $$")

@@ -155,7 +155,7 @@ def test_a_slot_whose_start_passed_in_a_stall_is_late_and_one_that_passed_was_no
     monkeypatch.setattr(Dispatcher, "_tick_until_boundary", wait_for_boundary)
     monkeypatch.setattr(Dispatcher, "_obey", lambda _: None)
     dispatcher.groups, dispatcher.all = [{}, {}, {}], frozenset({0, 1, 2})
-    dispatcher.own, dispatcher.counters = CoreNumbers(), [ServerNumbers() for _ in slots]
+    dispatcher.shared, dispatcher.counters = CoreNumbers(), [ServerNumbers() for _ in slots]
     dispatcher.open, dispatcher.unexamined, dispatcher.begun = frozenset(), set(), []
     dispatcher.let_go, dispatcher.owner = 0, os.getppid()
     dispatcher.last_sign = now = time.monotonic_ns()

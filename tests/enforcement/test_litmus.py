@@ -32,9 +32,10 @@ from chainshaper.enforcement.litmus import (
 from chainshaper.enforcement.node_threads import Allocation
 from chainshaper.enforcement.scheduling_memory import release_threads
 from chainshaper.enforcement.servers import BackEnd, ReservationServer, ServerTable
-from chainshaper.flow import threads
+from chainshaper.flow import anchoring
+from chainshaper.flow import planned_changes as changes
 from chainshaper.flow.phase import Phase
-from chainshaper.flow.threads import planned_changes
+from chainshaper.flow.planned_changes import planned_changes
 from chainshaper.linux.scheduling import available_cores, state_of
 from chainshaper.planning import Plan, save_plan
 from chainshaper.planning.chain_plan import Server, Thread, revised
@@ -88,8 +89,8 @@ def test_printed_commands_open_servers_for_overruns_as_apply_does(
     Cycles start 10 ms behind the anchor, at 9: the server is open for the first 7 ms from there.
     """
     plan = revised(small_chain_plan(10 * MS, 20 * MS), offset_ns=10 * MS)
-    monkeypatch.setattr(threads, "chain_phases", lambda *_: [Phase(17 * MS, 0)])
-    monkeypatch.setattr(threads, "find_threads", lambda *_, **__: Allocation((), ()))
+    monkeypatch.setattr(anchoring, "chain_phases", lambda *_: [Phase(17 * MS, 0)])
+    monkeypatch.setattr(changes, "find_threads", lambda *_, **__: Allocation((), ()))
     _, created, *_ = planned_changes(Plan.of(plan), "litmus").commands
     assert created[-3:] == ("[0,9)", "[9,16)", "[19,50)")
 
@@ -100,8 +101,8 @@ def test_printed_commands_close_the_papers_servers_where_the_plan_does(
     """Table 1: five callbacks in slots of 16 ms, whose timer expires 2 ms before the first. Left
     open until callbacks are done, all but the first end 1 ms before the timer expires again.
     """
-    monkeypatch.setattr(threads, "chain_phases", lambda *_: [Phase(98 * MS, 0)])
-    monkeypatch.setattr(threads, "find_threads", lambda *_, **__: Allocation((), ()))
+    monkeypatch.setattr(anchoring, "chain_phases", lambda *_: [Phase(98 * MS, 0)])
+    monkeypatch.setattr(changes, "find_threads", lambda *_, **__: Allocation((), ()))
     servers = [
         Server(
             name=f"node{number}",

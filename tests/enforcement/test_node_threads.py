@@ -32,7 +32,8 @@ from chainshaper.enforcement.thread_scheduling import (
     server_priorities,
     waiting_receivers,
 )
-from chainshaper.flow.threads import check_publishers, first_threads
+from chainshaper.flow.anchoring import first_threads
+from chainshaper.flow.plan_checks import check_publishers
 from chainshaper.linux.processes import RunningProcess, read_process
 from chainshaper.linux.scheduling import SchedulingRequest
 from chainshaper.linux.threads import RunningThread, ThreadRole, gate_thread_name, role_of

@@ -9,8 +9,8 @@ from bare_plans import MS, bare_plan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from chainshaper.flow.anchoring import placed
 from chainshaper.flow.phase import Phase
-from chainshaper.flow.threads import placed
 from chainshaper.planning.chain_plan import ChainPlan, Server, Thread
 from chainshaper.planning.offsets import LEAD_NS
 from chainshaper.planning.plan import Plan

@@ -20,7 +20,7 @@ from chainshaper.enforcement.freezer import Freezer
 from chainshaper.enforcement.node_threads import Allocation, NodeThread
 from chainshaper.enforcement.servers import ServerCounters
 from chainshaper.enforcement.undoing import RunState, SlotMove
-from chainshaper.flow import apply, threads
+from chainshaper.flow import anchoring, apply
 from chainshaper.flow.drift import SlotFollower, TimerTrack
 from chainshaper.flow.phase import DriftWatch, Phase
 from chainshaper.flow.plan_in_force import origins, supervision
@@ -243,7 +243,7 @@ def test_short_runs_are_looked_at_where_no_server_stops_a_thread(
     run.report.state = SimpleNamespace(servers=[governed], anchor_ns=0)  # type: ignore[assignment]
     first = SimpleNamespace(pid=7, tid=7, identity=(7, 1))
     watched: list[Any] = []
-    monkeypatch.setattr(threads, "first_threads", lambda *_: [(first,)])
+    monkeypatch.setattr(anchoring, "first_threads", lambda *_: [(first,)])
     monkeypatch.setattr(origins, "DriftWatch", lambda *given, **_: watched.append(given[-1]))
     run.origins.start(run.anchored, run.threads.latest, run.report)
     assert watched == [slots]
@@ -347,7 +347,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Supervision:
     monkeypatch.setattr(supervision, "note_descendants", lambda *_: set())
     monkeypatch.setattr(origins, "DriftWatch", Watch)
     monkeypatch.setattr(
-        threads, "measure_phase", lambda _, tids, *__, **___: Phase(TIMERS[tids[0]], 0)
+        anchoring, "measure_phase", lambda _, tids, *__, **___: Phase(TIMERS[tids[0]], 0)
     )
     run.threads.latest = found(7)
     find_anchor(run, None)
@@ -440,7 +440,7 @@ def test_a_first_node_that_is_started_again_without_a_timer_yet_is_looked_at_aga
         raise OperationError("thread 8 does not wake up at one place of the cycle 100 ms")
 
     with monkeypatch.context() as until:
-        until.setattr(threads, "measure_phase", measure)
+        until.setattr(anchoring, "measure_phase", measure)
         assert "thread 8 does not wake up" in run.look_again(())[1]
     assert (assigned, run.anchored.anchor_ns) == ([], 7 * MS)
     assert run.look_again(())[1] == ""
@@ -464,13 +464,13 @@ def test_of_two_chains_only_the_timer_that_is_new_is_measured(
         measured.extend(tids)
         return phases[1]
 
-    monkeypatch.setattr(threads, "measure_phase", measure)
+    monkeypatch.setattr(anchoring, "measure_phase", measure)
     again = Allocation((node(7, "/a"), node(8, "/b")), ())
     known = dict(enumerate(phases))
-    given, anchor_ns, waits_ns, _ = threads.carried_out(plan, start, None, known=known)
+    given, anchor_ns, waits_ns, _ = anchoring.carried_out(plan, start, None, known=known)
     assert (anchor_ns, waits_ns) == (10 * MS, [5 * MS, 2 * MS])
     del known[1]
-    assert threads.carried_out(given, again, None, known=known)[1:3] == (anchor_ns, waits_ns)
+    assert anchoring.carried_out(given, again, None, known=known)[1:3] == (anchor_ns, waits_ns)
     assert measured == [8]
 
 

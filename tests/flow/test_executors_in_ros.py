@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import polars as pl
 import pytest
-from ros2 import ros2_environment
+from ros2 import require_lttng_of_ros2, ros2_environment
 
 from chainshaper import load_plan, open_recording
 from chainshaper.analysis import analyse_latency, data_flow, executors
@@ -188,6 +188,8 @@ def test_traversals_and_threads_are_what_the_callbacks_say(
     ran: Ran, tmp_path: Path, language: str, executor_and_source: str, threads: list[int]
 ) -> None:
     executor, source = executor_and_source.split()
+    if source == "lttng":
+        require_lttng_of_ros2()
     several = executor == "multi"
     words = f"{executor} line 60 {30 if several else 5} {150 if several else 30} sleep"
     folder, _ = ran("record", language, words, "--source", source, "--duration", "8s")

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import polars as pl
 import pytest
-from ros2 import ros2_environment
+from ros2 import require_lttng_of_ros2, ros2_environment
 
 from chainshaper import (
     load_application,
@@ -193,6 +193,8 @@ def test_nodes_that_are_recorded_without_a_terminal_shut_down_in_order(
 def test_two_chains_are_shaped_by_one_command(
     run: Callable[..., Result], source: str, publication: str
 ) -> None:
+    if source == "lttng":
+        require_lttng_of_ros2()
     (first, *_, last), chains = available_cores(), ["/raw../rear../pose", "/ticked../commands"]
     options = ["--cores", f"{last},{first}", "--epsilon", "2ms", "--duration", "30s"]
     options += ["--source", source, "--publication", publication]

@@ -14,7 +14,7 @@ from roles import role
 from story import OFFSET, Story
 
 from chainshaper.flow.plan import profile_chains
-from chainshaper.flow.threads import planned_changes
+from chainshaper.flow.planned_changes import planned_changes
 from chainshaper.planning import (
     Plan,
     PlanRequest,

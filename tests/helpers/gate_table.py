@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeAlias
 import yaml
 
 from chainshaper.robot.decision import Release, missed
-from chainshaper.robot.gate import Gate, Modes
+from chainshaper.robot.gate import Gate, GateModes
 from chainshaper.robot.waiting import Queue
 
 MS = 1_000_000
@@ -79,7 +79,7 @@ def _ns(time: float) -> int:
 def _case(entry: dict[str, Any]) -> Case:
     known = dict(entry["gate"])
     slots = tuple((_ns(start), _ns(end)) for start, end in known.pop("slots"))
-    modes = Modes(**known.pop("modes")) if "modes" in known else None
+    modes = GateModes(**known.pop("modes")) if "modes" in known else None
     gate = Gate(slots=slots, cycle_ns=_ns(known.pop("cycle")), modes=modes, **known)
     both = [come if isinstance(come, list) else [come, come] for come in entry["arrivals"]]
     return Case(

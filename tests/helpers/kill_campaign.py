@@ -12,8 +12,8 @@ line of JSON for each case, and one with the sums of each lane; a case is repeat
 
 The instant is a random share of the time for which the verb went on the last time, behind its
 start, its first writing, or the moment from which its plan was in force. A case whose verb has
-ended before it is counted as `too late`, and not as a kill; it says how the verb has ended, so that
-a verb that is refused at once is seen. All lanes know how long verbs go on.
+ended before it is counted as `too late`, and not as a kill. All lanes know how long verbs go on.
+With `--rehearse` each verb goes on to its end before, so that one that is refused at once is seen.
 
 Python's own traceback is a finding, but for Ctrl-C before the first line of ours could run: until
 then the interpreter has its own handler, which no program can replace (`before our first line`).
@@ -143,12 +143,16 @@ def verbs(folder: Path) -> dict[str, tuple[list[str], Path | None]]:
         place = output.with_name(output.name + ending)
         return [*map(str, words), "-o", str(place)], place
 
-    said_apart = f'exec "$0" -S -c "$1" 2> {WORK}/application'
-    emitting = ("--", "sh", "-c", said_apart, sys.executable, _EMITS)
-    words, place = writing("", "record", "--source", "preload")
+    said_apart = f'exec "$0" -S -c "$@" 2> {WORK}/application'
+    node = ("--ros-args", "-r", "__node:=first")
+    emitting = ("--", "sh", "-c", said_apart, sys.executable, _EMITS, *node)
+    recorded, at = writing("", "record", "--source", "preload")
+    profiling = ("profile", "--node", "first", "--source", "preload", "--core", core())
+    profiled, _ = writing("", *profiling)
     live, live_plan, budget = (folder / name for name in ("live.yaml", "lplan.yaml", "budget.yaml"))
     package, figures = WORK / "small" / "pkg", WORK / "small" / "figures"
     watch = ("watch", "--every", "100ms", "--json", "--recorder", str(WORK / "small"))
+    chain = ("--chain", "/a../b")
     shape = ("shape", live, live_plan, "--cycles", 60)
     kept_plan, adapted = folder / "kplan.yaml", WORK / "small" / "adapted"
     adapting = ("apply", kept_plan, "--backend", "freezer", "--adapt", "--", *CLI, "shape")
@@ -164,9 +168,9 @@ def verbs(folder: Path) -> dict[str, tuple[list[str], Path | None]]:
         "shape": writing("", *shape),
         "shape-adapt": writing("", *shape, "--adapt"),
         "apply-adapt": ([*map(str, adapting)], adapted),
-        "watch": ([*watch, *emitting], None),
+        "watch": ([*watch, *chain, *emitting], None),
         "watch-plan": ([*watch, "--plan", str(plan), *emitting], None),
-        "watch-metrics": ([*watch, "--metrics", "9464", *emitting], None),
+        "watch-metrics": ([*watch, *chain, "--metrics", "9464", *emitting], None),
         "watch-budget": ([*watch, "--budget", str(budget), *emitting], None),
         "generate": (["generate", str(application), "-o", str(package)], package),
         "describe": writing(".yaml", "describe", recording),
@@ -185,13 +189,11 @@ def verbs(folder: Path) -> dict[str, tuple[list[str], Path | None]]:
             ["demo", "--application", str(live), "--cycles", "60", "-o", str(WORK / "small" / "d")],
             None,
         ),
-        "profile": writing(
-            "", "profile", "--node", "first", "--source", "preload", "--core", core(), *emitting
-        ),
+        "profile": ([*profiled, *emitting], at),
         "handover": ([str(WORK / "pages"), str(HERE.parent / "robot" / "output_process.py")], None),
         "apply": (["apply", servers, "--backend", "freezer", "--phase", "0ms"], None),
         "apply-fifo": (["apply", servers, "--backend", "fifo", "--phase", "0ms"], None),
-        "record": ([*words, *emitting], place),
+        "record": ([*recorded, *emitting], at),
         "simulate": writing("", "simulate", application, "--cycles", 300),
         "sweep": writing(
             ".parquet", "sweep", application, "--cycles", 2000, "--vary", "bands=1,2,3"
@@ -290,7 +292,7 @@ class Victim:
         self.group = mount_point() / os.fsdecode(b"victim\xfc-%d" % random.getrandbits(32))
         self.group.mkdir()
         output = WORK / "victim"
-        self.process = subprocess.Popen(node_command("victim", output, 50_000_000, 1_000_000))
+        self.process = subprocess.Popen(node_command("victim", output, 100_000_000, 100_000))
         (self.group / "cgroup.procs").write_text(str(self.process.pid))
         wait(lambda: output.exists() and output.stat().st_size > 0, 30)
         self.before = scheduling(self.process.pid)
@@ -305,7 +307,7 @@ class Victim:
             said.append(f"the node's scheduling is {now}, and was {self.before}")
         said += [f"the group {one.name} is left" for one in self.group.iterdir() if one.is_dir()]
         ran = cpu_ns(pid)
-        if not wait(lambda: cpu_ns(pid) > ran, 2):
+        if not wait(lambda: cpu_ns(pid) > ran, 10):
             said.append("the node does not run")
         return said
 
@@ -321,13 +323,14 @@ def _removed(group: Path) -> bool:
     return group.exists()
 
 
-def wait(condition: Callable[[], bool], seconds: float, pause_s: float = 0.02) -> bool:
-    """Whether it comes true before the time is over."""
-    deadline = time.monotonic() + seconds
+def wait(condition: Callable[[], bool], seconds: float) -> bool:
+    """Whether it comes true before the time is over; what takes long is looked at less often."""
+    began = time.monotonic()
     while not condition():
-        if time.monotonic() > deadline:
+        waited_s = time.monotonic() - began
+        if waited_s > seconds:
             return False
-        time.sleep(pause_s)
+        time.sleep(min(0.2, max(0.003, waited_s / 100)))
     return True
 
 
@@ -360,13 +363,14 @@ def await_instant(
     if case.behind == "in force":
         wait(lambda: b"in force" in output_of() or ended(), 60)
     elif case.behind == "writing":
-        wait(lambda: writes() or ended(), 60, 0.002)
+        wait(lambda: writes() or ended(), 60)
     if ended():
         case.ended = f"before {case.behind}: "
         return
     began, span_s = time.monotonic(), known_span(folder, case)
     case.after_s = round(chance.uniform(0, span_s), 4)
-    wait(ended, case.after_s, 0.002)
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(case.after_s)
     note_span(folder, case, time.monotonic() - began if ended() else span_s * LONGER)
 
 
@@ -389,9 +393,9 @@ def run_case(case: Case, folder: Path, victim: Victim) -> None:
                 stdout=said,
                 stderr=said,
             )
-        if case.verb.startswith("apply") and chance.random() < 0.7:
+        if case.verb.startswith("apply") and case.full != "/run" and chance.random() < 0.7:
             case.behind = "in force"
-        elif output is not None and chance.random() < 0.5:
+        elif output is not None and not case.full and chance.random() < 0.5:
             case.behind = "writing"
         await_instant(case, process, folder, chance)
         pids = marked_processes(marker)
@@ -405,6 +409,40 @@ def run_case(case: Case, folder: Path, victim: Victim) -> None:
     for pid in marked_processes(marker):
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
+
+
+def rehearse(verb: str, folder: Path) -> Case:
+    """Let a verb go on to its end; a plan that is in force is ended by Ctrl-C, nodes are killed."""
+    from processes import marked_processes
+
+    case, marker = Case(0, verb, behind="end"), f"CASE={uuid.uuid4().hex}"
+    words, output = verbs(folder)[verb]
+    environment, began = {**os.environ, **dict([marker.split("=")])}, time.monotonic()
+    with (WORK / "said").open("wb") as said:
+        process = subprocess.Popen(
+            command(verb, words),
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=said,
+            stderr=said,
+        )
+    stays = verb.startswith("apply") and output is None
+
+    def done() -> bool:
+        return process.poll() is not None or (stays and b"in force" in output_of())
+
+    wait(done, 3 if verb == "handover" else 90)
+    if process.poll() is None:
+        case.faults.append("SIGINT, for it went on")
+        process.send_signal(signal.SIGINT)
+    process.wait()
+    case.after_s = round(time.monotonic() - began, 3)
+    last = output_of().decode(errors="replace").strip().rpartition("\n")[2]
+    case.ended = f"exit code {process.returncode}: {last[-300:]}"
+    for pid in marked_processes(marker):
+        os.kill(pid, signal.SIGKILL)
+    remove_outputs()
+    return case
 
 
 def kill_some(
@@ -473,7 +511,11 @@ def look_behind(case: Case, victim: Victim, marker: str, output: Path | None) ->
             case.left.append(f"beside the output: {one.name!r}")
     if output is not None:
         case.left += half_written(output)
-    for place in (small, *EMPTY):
+    remove_outputs()
+
+
+def remove_outputs() -> None:
+    for place in (WORK / "small", *EMPTY):
         for one in place.iterdir():
             subprocess.run(["rm", "-rf", str(one)], check=True)
 
@@ -551,6 +593,7 @@ def main() -> None:
     arguments.add_argument("--seed", type=int, default=1)
     arguments.add_argument("--seconds", type=float, default=600.0, help="no case begins later")
     arguments.add_argument("--verbs", nargs="+", help="of these alone; apply alone is real-time")
+    arguments.add_argument("--rehearse", action="store_true", help="each verb once, to its end")
     arguments.add_argument("--lanes", type=int, default=1, help="so many cases side by side")
     arguments.add_argument("--core", type=int, help="run on this core alone")
     arguments.add_argument("--pause-while", type=Path, metavar="FILE")
@@ -566,6 +609,7 @@ def main() -> None:
 
         for lane in range(given.lanes):
             group = mount_point() / f"kills-{os.getpid()}-{lane}"
+            _remove_groups(group)
             wait(lambda group=group: not _removed(group), 5)  # type: ignore[misc]
         sys.exit(any(codes))
     number, _, inputs = os.environ.pop(INSIDE).partition(" ")
@@ -595,8 +639,13 @@ def run_lane(given: argparse.Namespace, lane: int, folder: Path) -> bool:
         mount(place, size)
     sums, until = Counter[str](), time.monotonic() + given.seconds
     mount_disks()
+    (groups / "cases").mkdir()  # beside the victim's: threads of a group that has others in it
+    (groups / "cases" / "cgroup.procs").write_text("0")  # are not frozen one by one
     names = given.verbs or sorted(verbs(folder))
     victim, kills = Victim(), -(-given.kills // given.lanes)
+    for verb in names[lane :: given.lanes] if given.rehearse else ():
+        sys.stdout.write(json.dumps(vars(rehearse(verb, folder))) + "\n")
+        sys.stdout.flush()
     for seed in itertools.count(given.seed + lane, given.lanes):
         while pause is not None and given.pause_while.name in os.listdir(pause):  # noqa: PTH208
             time.sleep(1)

@@ -2,10 +2,25 @@
 
 import functools
 import os
+import shutil
 import subprocess
+import tempfile
 from pathlib import Path
 
 import pytest
+
+_LISTED_BY_LTTNG = """
+if [ "$(id -u)" -eq 0 ]; then
+    mkdir -p /var/run/lttng && mount -t tmpfs tmpfs /var/run/lttng || exit
+fi
+lttng-sessiond --quiet &
+daemon=$!
+trap 'kill $daemon; wait $daemon' EXIT
+until lttng --no-sessiond list > /dev/null 2>&1; do kill -0 $daemon && sleep 0.1 || exit; done
+exec 3>&1
+python3 -c 'import os, rclpy; rclpy.init(); os.system("lttng --no-sessiond list --userspace >&3")'
+"""
+"""Prints the trace points of a process of ROS 2, as a session daemon of its own lists them."""
 
 
 def ros2_environment() -> dict[str, str]:
@@ -17,6 +32,40 @@ def ros2_environment() -> dict[str, str]:
     if environment is None:
         pytest.skip("no ROS 2: source its setup.bash, or name it in ROS2_SETUP")
     return {**environment, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+
+
+def require_lttng_of_ros2() -> None:
+    """Skip a test that records ROS 2 with LTTng where the two do not find each other.
+
+    The tracetools of ROS 2 may be built without trace points, or for another version of LTTng than
+    the session daemon here: one of 2.13 and later does not hear what is built for 2.12.
+    """
+    ros2_environment()
+    if (reason := _why_not_traced()) is not None:
+        pytest.skip(reason)
+
+
+@functools.cache
+def _why_not_traced() -> str | None:
+    """Return why LTTng does not record ROS 2 here; None: it does."""
+    for tool in ("lttng", "lttng-sessiond"):
+        if shutil.which(tool) is None:
+            return f"{tool} is not installed here (package lttng-tools)"
+    # Root's daemon has its sockets in one place, where another one may have them already.
+    apart = ["unshare", "--mount", "--propagation=slave"] if os.geteuid() == 0 else []
+    # The paths of the sockets may have 108 characters only.
+    with tempfile.TemporaryDirectory(prefix="lttng-", dir="/tmp") as home:
+        listed = subprocess.run(
+            ["env", *apart, "bash", "-c", _LISTED_BY_LTTNG],
+            env={**ros2_environment(), "LTTNG_HOME": home, "LTTNG_UST_REGISTER_TIMEOUT": "30000"},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    if " ros2:rcl_init " in listed.stdout:
+        return None
+    said = " ".join((listed.stdout + listed.stderr).split())
+    return f"LTTng here finds no trace points of this ROS 2: {said}"
 
 
 @functools.cache

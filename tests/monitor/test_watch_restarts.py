@@ -165,6 +165,26 @@ def test_what_was_before_the_watch_is_none_of_it(
     assert tables["rcl_node_init"]["time"][0] < began
 
 
+def test_a_look_that_is_held_up_counts_no_cycle_whose_events_it_has_not_read(
+    simulated: "Callable[..., Simulated]", monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a busy machine nobody knows how long it takes from the last record to the clock."""
+    one = simulated()
+    one.go_on(10)
+    read = one.watch.read
+
+    def held_up() -> None:
+        read()
+        one.go_on(6, look=False)
+
+    incomplete = one.application.cycles["incomplete"]
+    with monkeypatch.context() as patch:
+        patch.setattr(one.watch, "read", held_up)
+        assert counted(one.watch.look())["incomplete"] <= incomplete
+    one.go_on(4)
+    assert counted(one.go_on(2)[-1])["incomplete"] <= one.application.cycles["incomplete"]
+
+
 @pytest.mark.parametrize("every", [4, 20])
 def test_looks_that_come_late_count_all_cycles_and_the_recorder_has_those_of_the_last(
     simulated: "Callable[..., Simulated]", tmp_path: Path, every: int

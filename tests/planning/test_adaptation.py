@@ -19,7 +19,7 @@ from scipy.special import bdtrc
 from small_chain import small_chain_plan
 
 from chainshaper.flow.drift import SlotFollower
-from chainshaper.flow.threads import followed_chains
+from chainshaper.flow.followed_chains import followed_chains
 from chainshaper.planning.adaptation import Tail
 from chainshaper.planning.chain_plan import (
     Adaptation,

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chainshaper import load_plan, save_plan
-from chainshaper.flow.threads import server_table
+from chainshaper.flow.server_tables import server_table
 from chainshaper.planning.chain_plan import ChainPlan, Server, Slot, Thread, revised
 from chainshaper.planning.plan import Plan, plan_of_chain
 from chainshaper.planning.plan_file import dump_plan, plan_in, plan_values

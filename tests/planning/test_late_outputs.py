@@ -13,7 +13,8 @@ from known import known
 from small_chain import small_chain_plan
 
 from chainshaper.enforcement.litmus import litmus_commands
-from chainshaper.flow.threads import refuse_unfit, server_table
+from chainshaper.flow.plan_checks import refuse_unfit
+from chainshaper.flow.server_tables import server_table
 from chainshaper.planning import (
     PlanRequest,
     Profile,

@@ -19,7 +19,7 @@ from unittest.mock import MagicMock
 
 from chainshaper.robot import handover
 from chainshaper.robot.decision import DROPPED, Release
-from chainshaper.robot.gate import Gate, Modes
+from chainshaper.robot.gate import Gate, GateModes
 from chainshaper.robot.waiting import Outcome, Waiting
 
 
@@ -38,7 +38,7 @@ def main() -> None:
     folder, what, name, port, hold = sys.argv[1:]
     handover.page_folders = lambda: iter([folder])
     if what == "starting":
-        modes, asked = Modes({"city": 0, "highway": 0}, "city"), list[object]()
+        modes, asked = GateModes({"city": 0, "highway": 0}, "city"), list[object]()
         shaper = MagicMock(gate=Gate(((0, 1),), 2, modes=modes))
         shaper.queue.set_phase = shaper.queue.switch = lambda what, _: asked.append(what)
         handover.Turn(name, "/t5").go_on(shaper)

@@ -16,7 +16,7 @@ from passing import decided, held, serialized
 
 from chainshaper.robot import shaper as shaping
 from chainshaper.robot.decision import Release, missed, release_of
-from chainshaper.robot.gate import LATE, OVERRUNS, Gate, Modes, Overrun
+from chainshaper.robot.gate import LATE, OVERRUNS, Gate, GateModes, Overrun
 from chainshaper.robot.schedules import (
     SCHEDULES,
     Schedule,
@@ -37,7 +37,7 @@ BANDS = Gate(slots=((20, 25), (25, 30), (80, 100)), cycle_ns=100)
 TWO = Gate(slots=((20, 30), (60, 61)), cycle_ns=100)
 DISCARD, PUBLISH = replace(TWO, overrun="discard"), replace(TWO, overrun="publish")
 # The last slot is the city's.
-MODES = Modes(bands={"city": 2, "village": 1, "highway": 0}, default="city")
+MODES = GateModes(slots={"city": 2, "village": 1, "highway": 0}, default="city")
 MODAL = Gate(slots=((20, 21), (40, 42), (60, 61)), cycle_ns=100, modes=MODES)
 MODAL_MS = Gate(
     slots=tuple((start * MS, end * MS) for start, end in MODAL.slots),
@@ -160,8 +160,8 @@ def _inside_a_slot(gate: Gate, since_origin: int) -> bool:
         ({"overrun": "drop"}, "choose one of wait, discard, publish"),
         ({"due_cycles": -1}, "due beforehand"),
         ({"depth": 0}, "for one at least"),
-        ({"modes": ({"city": 3}, "city")}, "numbered 0 to 0"),
-        ({"modes": ({"city": -1}, "city")}, "numbered 0 to 0"),
+        ({"modes": ({"city": 3}, "city")}, "numbered 1 to 1"),
+        ({"modes": ({"city": -1}, "city")}, "numbered 1 to 1"),
         ({"modes": ({"city": 0}, "sea")}, "'sea' has no band: choose one of city"),
         ({"modes": ({"city": 0}, "city", "never")}, "choose one of wait, .*next-slot"),
     ],
@@ -169,7 +169,7 @@ def _inside_a_slot(gate: Gate, since_origin: int) -> bool:
 def test_gates_that_make_no_sense_are_refused(changes: dict[str, Any], reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         replace(
-            ONE, **changes | ({"modes": Modes(*changes["modes"])} if "modes" in changes else {})
+            ONE, **changes | ({"modes": GateModes(*changes["modes"])} if "modes" in changes else {})
         )
 
 
@@ -263,7 +263,7 @@ def test_a_change_is_in_force_from_the_next_cycle_on() -> None:
 
 
 LATER = st.integers(0, 400)
-CHANGES = st.lists(st.tuples(LATER, st.sampled_from(sorted(MODES.bands)))).map(sorted)
+CHANGES = st.lists(st.tuples(LATER, st.sampled_from(sorted(MODES.slots)))).map(sorted)
 
 
 @given(st.sampled_from(LATE), st.sampled_from(OVERRUNS), LATER, LATER, CHANGES)
@@ -272,7 +272,7 @@ def test_a_cycle_has_one_mode_and_messages_leave_in_its_slot_unless_late(
 ) -> None:
     schedules = announced(*changes)
     release = release_of(with_late(late, overrun), arrival, 0, schedules)
-    band = MODES.bands[known(release.mode)]
+    band = MODES.slots[known(release.mode)]
     start, end = MODAL.slots[band]
     assert (release.overrun is None) == (arrival < end)
     if release.overrun is None:

@@ -63,7 +63,8 @@ def as_application(case: Case) -> Application:
             timer = {"timer": period, "phase": f"{time}ns", "announces": [mode]}
             driver = {"callbacks": [{**timer, "publishes": ["/mode"]}]}
             nodes[f"driver{number}"] = {"core": 40 + number, **driver}
-        modes = {"bands": dict(gate.modes.bands), "default": gate.modes.default}
+        bands = {mode: place + 1 for mode, place in gate.modes.slots.items()}
+        modes = {"bands": bands, "default": gate.modes.default}
         described["modes"] = {"topic": "/mode", "late": gate.modes.late, **modes}
     shape = {"subscription": "/in", "publishes": ["/out"], "gate": described}
     nodes["shaper"] = {"core": 2, "callbacks": [shape]}

@@ -12,7 +12,7 @@ from known import known
 from traced_program import built, skip_without_bpftrace
 
 import chainshaper as cs
-from chainshaper.flow.threads import recorded_processes
+from chainshaper.flow.recorded_processes import recorded_processes
 from chainshaper.linux.processes import RunningProcess, user_of
 from chainshaper.sources.preload import installed_library
 from chainshaper.sources.system import NEXT_HOST

@@ -19,7 +19,6 @@ from odd_names import ODD_NAMES
 from processes import wait_for
 
 from chainshaper.flow.record import _known_endpoints
-from chainshaper.sources import preload
 from chainshaper.sources.preload import (
     RECORD,
     PreloadTracer,
@@ -27,12 +26,15 @@ from chainshaper.sources.preload import (
     event_names,
     installed_library,
 )
+from chainshaper.sources.preload import memory as layout
+from chainshaper.sources.preload import tracer as tracing
+from chainshaper.sources.preload.events_header import FORMAT
 from chainshaper.values.errors import InputError, text_of
 from chainshaper.values.recording import Recording, open_recording, write_recording
 
 COUNT = int(os.environ.get("CHAINSHAPER_DAMAGED_MEMORIES", "100"))
 RINGS, RING_RECORDS, OBJECT_RECORDS = 2, 8, 12
-NUMBERS = {name: number for number, name in enumerate(event_names(), preload._FIRST_EVENT)}
+NUMBERS = {name: number for number, name in enumerate(event_names(), layout.FIRST_EVENT)}
 ADD_SEALS, SHRINK = 1033, 2
 EXTREMES = (
     *(0, 1, 2, 3, 41, 255, 1 << 15, (1 << 16) - 1, (1 << 31) - 1, 1 << 31, (1 << 32) - 1),
@@ -43,13 +45,13 @@ EXTREMES = (
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Memories of few records: those of the library have a million."""
-    of_objects = preload._HEADER.itemsize + RINGS * preload._RING.itemsize
+    of_objects = layout.HEADER.itemsize + RINGS * layout.RING.itemsize
     of_records = of_objects + OBJECT_RECORDS * RECORD.itemsize
     sizes = {"_RINGS": RINGS, "_RING_RECORDS": RING_RECORDS, "_OBJECT_RECORDS": OBJECT_RECORDS}
     sizes |= {"_OF_OBJECTS": of_objects, "_OF_RECORDS": of_records}
     sizes["_SIZE"] = of_records + RINGS * RING_RECORDS * RECORD.itemsize
     for name, size in sizes.items():
-        monkeypatch.setattr(preload, name, size)
+        monkeypatch.setattr(layout, name, size)
 
 
 def records(count: int, event: str, pid: int) -> NDArray[Any]:
@@ -66,16 +68,16 @@ def _texts_of(objects: NDArray[Any]) -> NDArray[np.uint8]:
 
 def whole_memory(pid: int, text: bytes = b"node") -> bytearray:
     """One that the library may have written: a node, and five events in each ring."""
-    header = np.zeros(1, preload._HEADER)
-    values = (preload._MAGIC, preload._FORMAT, pid, RINGS, RING_RECORDS, OBJECT_RECORDS, 3)
-    for name, value in zip((*preload._COUNTS, "objects"), values, strict=True):
+    header = np.zeros(1, layout.HEADER)
+    values = (layout.MAGIC, FORMAT, pid, RINGS, RING_RECORDS, OBJECT_RECORDS, 3)
+    for name, value in zip((*layout.COUNTS, "objects"), values, strict=True):
         header[name] = value
-    rings = np.zeros(RINGS, preload._RING)
+    rings = np.zeros(RINGS, layout.RING)
     rings["written"] = 5
     objects = np.zeros(OBJECT_RECORDS, RECORD)
     objects[:3] = records(3, "rcl_node_init", pid)
     for place, said in enumerate((text, b"/")):
-        objects["event"][1 + place] = preload._TEXT
+        objects["event"][1 + place] = layout.TEXT
         objects["values"][1 + place] = 0
         objects["values"][1 + place, 0] = 16 * len(said) + 2 + place
         _texts_of(objects)[1 + place, : len(said)] = [*said]
@@ -89,7 +91,7 @@ def damaged_memory(chance: random.Random, pid: int) -> bytes:
     kind = chance.randrange(4)
     if kind == 0:
         return chance.randbytes(len(memory))
-    header = preload._HEADER.itemsize
+    header = layout.HEADER.itemsize
     if kind == 1:
         return bytes(memory[:header]) + chance.randbytes(len(memory) - header)
     for _ in range(chance.randint(1, 12)):
@@ -164,7 +166,7 @@ def test_memories_of_any_content_cost_no_other_process_an_event(tmp_path: Path) 
 BAD = {
     "tid": (0, 1 << 22 | 1, (1 << 32) - 1),
     "time": (-1, 1 << 62),
-    "event": (0, preload._TEXT, NUMBERS["rcl_node_init"], 99, (1 << 16) - 1),
+    "event": (0, layout.TEXT, NUMBERS["rcl_node_init"], 99, (1 << 16) - 1),
 }
 
 
@@ -191,12 +193,12 @@ def test_what_stands_before_a_bad_record_is_there_and_what_follows_is_counted(
 def test_texts_of_an_event_that_was_not_finished_are_no_other_events(tmp_path: Path) -> None:
     """A process was killed while it wrote: the texts are there, the event's number is not."""
     memory = whole_memory(7)
-    at = preload._HEADER.itemsize + RINGS * preload._RING.itemsize
+    at = layout.HEADER.itemsize + RINGS * layout.RING.itemsize
     objects = np.frombuffer(memory, RECORD, OBJECT_RECORDS, at)
     objects[3:6] = objects[:3]
     objects["event"][3] = 0
     _texts_of(objects)[4, :5] = [*b"other"]
-    np.frombuffer(memory, preload._HEADER, 1)["objects"][0] = 6
+    np.frombuffer(memory, layout.HEADER, 1)["objects"][0] = 6
     tracer = PreloadTracer(tmp_path, ["command"], ())
     add(tracer, bytes(memory), 7)
     nodes = recorded(tracer, tmp_path / "recording").events["rcl_node_init"]
@@ -208,7 +210,7 @@ def test_a_reader_that_ends_says_why_and_what_there_was_is_recorded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tracer = PreloadTracer(tmp_path, ["command"], ())
-    monkeypatch.setattr(preload, "installed_library", lambda: Path("/library.so"))
+    monkeypatch.setattr(tracing, "installed_library", lambda: Path("/library.so"))
     try:
         tracer.start()
         add(tracer, bytes(whole_memory(7)), 7)

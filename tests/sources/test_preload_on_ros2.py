@@ -39,6 +39,7 @@ def launch(in_ros2: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> li
 
 @pytest.mark.ros2
 @pytest.mark.timeout(300)
+@pytest.mark.usefixtures("lttng_of_ros2")
 def test_events_are_those_of_lttng_one_by_one(
     launch: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -84,6 +85,7 @@ def cut(table: pl.DataFrame) -> pl.DataFrame:
 
 @pytest.mark.ros2
 @pytest.mark.timeout(300)
+@pytest.mark.usefixtures("lttng_of_ros2")
 def test_what_is_watched_is_what_lttng_records(
     launch: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -131,7 +133,7 @@ def test_diagnostics_are_published_where_ros_2_reads_them(launch: list[str]) -> 
     ) as watching:
         time.sleep(8)  # for the nodes, and for what publishes beside them
         topic = ["/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"]
-        echo = ["ros2", "topic", "echo", "--once", "--full-length", *topic]
+        echo = ["ros2", "topic", "echo", "--no-daemon", "--once", "--full-length", *topic]
         heard = subprocess.run(
             ["env", *echo], capture_output=True, text=True, check=False, timeout=60
         )

@@ -50,7 +50,7 @@ Gate read_gate() {
   if (const auto modes = number(); modes > 0) {
     for (auto mode = 0; mode < modes; ++mode) {
       gate.modes.push_back("mode" + std::to_string(mode));
-      gate.bands.push_back(static_cast<std::size_t>(number()));
+      gate.mode_slots.push_back(static_cast<std::size_t>(number()));
     }
     gate.first_mode = static_cast<std::size_t>(number());
     gate.late = static_cast<Policy>(number());
@@ -154,7 +154,7 @@ void write_log(const std::string & path, std::int64_t most_bytes, int rows) {
   gate.cycle_ns = 1'000'000'000;
   gate.overrun = Policy::discard;
   gate.modes = {"city", "highway"};
-  gate.bands = {0, 0};
+  gate.mode_slots = {0, 0};
   gate.first_mode = 1;
   gate.late = Policy::discard;
   Shaper<int> shaper(gate, 0);

@@ -16,6 +16,7 @@ from rclpy.node import Node
 
 PERIOD_S = 0.1
 AT_ONCE = 3  # so many wait in the shaping node together
+DEPTH = 200  # nothing is dropped on a machine that stands still for some seconds
 
 
 def main() -> None:
@@ -29,10 +30,13 @@ def main() -> None:
 
         if what == "receiver":
             node.create_subscription(
-                PointStamped, "output", lambda message: note(message.point.x), 10
+                PointStamped, "output", lambda message: note(message.point.x), DEPTH
             )
         else:
-            publisher, message = node.create_publisher(PointStamped, "output", 10), PointStamped()
+            publisher, message = (
+                node.create_publisher(PointStamped, "output", DEPTH),
+                PointStamped(),
+            )
 
             def publish() -> None:
                 message.header.stamp = node.get_clock().now().to_msg()

@@ -12,7 +12,15 @@ from cpp_program import compiled
 from gate_table import PUBLISHING_NS, Case, Change, Outcome, What, cases, walk
 
 from chainshaper.robot.decision import DROPPED
-from chainshaper.robot.gate import ANCHORS, INTO_OPEN_SLOT, LATE, MESSAGES, OVERRUNS, Gate, Modes
+from chainshaper.robot.gate import (
+    ANCHORS,
+    INTO_OPEN_SLOT,
+    LATE,
+    MESSAGES,
+    OVERRUNS,
+    Gate,
+    GateModes,
+)
 from chainshaper.robot.serialized import origin_of
 from chainshaper.sources.gate_log import read_gate_log
 
@@ -31,7 +39,7 @@ def driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def as_text(case: Case) -> str:
     """A case as the driver reads it; modes are named by their numbers."""
     gate, modes = case.gate, case.gate.modes
-    names = [] if modes is None else list(modes.bands)
+    names = [] if modes is None else list(modes.slots)
     words: list[int | str] = [
         *(ANCHORS.index(gate.anchor), gate.phase_ns, LATE.index(gate.overrun), gate.due_cycles),
         *(MESSAGES.index(gate.messages), gate.depth, gate.cycle_ns),
@@ -40,7 +48,7 @@ def as_text(case: Case) -> str:
         len(names),
     ]
     if modes is not None:
-        words += [*modes.bands.values(), names.index(modes.default), LATE.index(modes.late)]
+        words += [*modes.slots.values(), names.index(modes.default), LATE.index(modes.late)]
     words += [len(case.changes)]
     for change in case.changes:
         value = names.index(change.value) if isinstance(change.value, str) else change.value
@@ -53,7 +61,7 @@ def as_text(case: Case) -> str:
 def as_answer(case: Case, outcome: Outcome) -> str:
     """What becomes of a message, as the driver prints it."""
     release, dash = outcome.release, _or_dash
-    names = [] if case.gate.modes is None else list(case.gate.modes.bands)
+    names = [] if case.gate.modes is None else list(case.gate.modes.slots)
     words = [
         *(dash(outcome.left_ns), dash(release.at_ns), release.origin_ns, dash(release.slot)),
         *(release.cycles_waited, ANCHORS.index(release.anchor), _place(LATE, release.overrun)),
@@ -79,7 +87,7 @@ def _any_case(draw: random.Random) -> Case:
     modes, changes = None, list[Change]()
     if draw.random() < 0.5:
         bands = {f"mode{n}": draw.randrange(len(slots)) for n in range(draw.randint(1, 3))}
-        modes = Modes(bands, draw.choice(list(bands)), draw.choice(LATE))
+        modes = GateModes(bands, draw.choice(list(bands)), draw.choice(LATE))
         times = [draw.randint(0, 300) * scale for _ in range(draw.randint(0, 4))]
         changes += [Change(time, "mode", draw.choice(list(bands))) for time in times]
     gate = Gate(

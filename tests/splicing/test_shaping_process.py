@@ -146,7 +146,7 @@ def test_a_gate_with_modes_is_the_same_behind_its_parameters(
     assert parameters_from(parameters).gate() == gate
     assert parameters["slots_ns"] == [bound for slot in SLOTS for bound in slot]
     modes = {key: value for key, value in parameters.items() if key.startswith("mode")}
-    names = {"mode_names": ["city", "highway"], "mode_slots": [1, 0]}  # the places of their slots
+    names = {"mode_names": ["city", "highway"], "mode_slots": [2, 1]}
     usual = {"mode_topic": "/mode", "mode_default": "city", "mode_late": "next-slot"}
     assert modes == names | usual
 

@@ -182,6 +182,28 @@ def test_what_a_stopped_node_finds_when_it_goes_on_is_neither_doubled_nor_counte
     assert any("it hangs, or was stopped" in text for text in standby.logged)
 
 
+def test_what_came_before_the_standby_is_not_published_behind_what_that_has_published(
+    tmp_path: Path, plan: ChainPlan
+) -> None:
+    """Both are started again; the node's reader has a message which the standby's has not."""
+    process, beside = written(plan, tmp_path)
+    with running_node(beside, tmp_path) as standby, running_node(process, tmp_path) as shaping:
+        shaping.process.send_signal(signal.SIGSTOP)
+        say(1, shaping)
+        for number in (2, 3):
+            say(number, shaping, standby)
+            standby.hear_published()
+        say(4, shaping)
+        shaping.process.send_signal(signal.SIGCONT)
+        shaping.hear_published()
+        shaping.end()
+        standby.end()
+    assert (came(shaping), came(standby)) == ([4], [2, 3])
+    gate = read_gate_log(tmp_path / "gate.csv")
+    assert gate["source_timestamp"].to_list() == [1001, 1004]
+    assert gate["dropped"].to_list() == ["replaced", None], "it is counted"
+
+
 def test_with_the_fallback_silence_nothing_is_published_and_all_is_counted(
     tmp_path: Path, plan: ChainPlan
 ) -> None:

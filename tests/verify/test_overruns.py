@@ -32,7 +32,7 @@ from chainshaper.robot.clocks import sleep_until
 from chainshaper.robot.gate import Overrun
 from chainshaper.values.recording import Recording
 from chainshaper.verify.overruns import (
-    Outcome,
+    OverrunOutcome,
     dropped_text,
     gate_releases,
     overruns_in,
@@ -148,7 +148,7 @@ def test_whatever_becomes_of_an_overrun_the_next_output_is_in_its_slot(
             break
     count = 3  # as drawn, live and simulated
     late = 0 if policy == "discard" else count
-    expected = {policy: Outcome(late, discarded=count - late, followed=count, next_hit=0)}
+    expected = {policy: OverrunOutcome(late, discarded=count - late, followed=count, next_hit=0)}
     assert measure_latency(simulated).outcomes == found == expected
     assert not leftovers()
 
@@ -163,7 +163,9 @@ def test_of_a_gated_publisher_too_what_missed_its_slot_is_counted(
     wishes: dict[str, Any] = {"publication": "asynchronous", "publish_slot_ns": 10 * MS}
     plan = small_chain_plan(6 * MS, 9 * MS, core=EXECUTOR_CORE, overrun=policy, **wishes)
     measured = measure_latency(simulate(application, tmp_path / "rec", Plan.of(plan), cycles=40))
-    assert measured.outcomes == {policy: Outcome(late=3, discarded=0, followed=3, next_hit=0)}
+    assert measured.outcomes == {
+        policy: OverrunOutcome(late=3, discarded=0, followed=3, next_hit=0)
+    }
     assert measured.overruns == {policy: 3}
 
 

@@ -53,6 +53,18 @@ _handlers: list[Any] = []  # ctypes forgets a callback that nothing refers to
 
 def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
     """Run these arguments (default: the process's own); help calls the command ``name``."""
+    try:
+        _run(arguments, name)
+    except KeyboardInterrupt:  # while it says how it has ended
+        sys.exit(130)
+    finally:  # while the interpreter ends, a handler of ours would end in a traceback
+        for number in _ENDING:
+            if signal.getsignal(number) is _end_in_order:
+                signal.signal(number, signal.SIG_DFL)
+
+
+def _run(arguments: list[str] | None, name: str) -> None:
+    """As :func:`main`, but signals go on raising KeyboardInterrupt where they do so here."""
     from chainshaper.cli.output import say
     from chainshaper.values.errors import ChainshaperError, shown
 
@@ -68,7 +80,7 @@ def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
         sys.exit(code)
 
     try:
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        for number in _ENDING:
             # As chainshaper.__main__ does for Ctrl-C; a signal that nohup ignores stays ignored.
             if signal.getsignal(number) == signal.SIG_DFL:
                 signal.signal(number, _end_in_order)
@@ -106,6 +118,7 @@ def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
         fail(message, 1)
 
 
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _interrupted: list[int] = []
 """The signals that have asked this process to end."""
 

@@ -166,8 +166,10 @@ def lost_events(recording: "cs.Recording") -> str:
 
 def stop_on_signals() -> AbstractContextManager[threading.Event]:
     """Yield an event that Ctrl-C, a closed terminal or `kill` sets: an order to finish."""
-    nohup = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
-    return set_by(signal.SIGINT, signal.SIGTERM, *(() if nohup else (signal.SIGHUP,)))
+    orders = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as it is under nohup
+        orders.append(signal.SIGHUP)
+    return set_by(*orders)
 
 
 @contextmanager

@@ -360,7 +360,9 @@ def splice(
         raise InputError("--node python needs no building: leave out --build, or choose another")
     if build and language_of(node, builds=True)[0] == "cpp":
         check_build_tools()  # before anything is written
-    words = [*([str(plan)] if throttle and plan is not None else []), *(launch or [])]
+    words = launch or []
+    # With --throttle there is no plan: the first word is a launch file, too.
+    words = [str(plan), *words] if throttle and plan is not None else words
     ran = words[:2] == ["ros2", "run"]
     arguments = {} if ran else dict(word.split(":=", 1) for word in words if ":=" in word)
     files = words if ran else [word for word in words if ":=" not in word]

@@ -27,7 +27,7 @@ class ChainCommand:
         parser.print_help = lambda *_: _run(["--help"])  # type: ignore[assignment,method-assign]
 
     def main(self, *, args: argparse.Namespace, **_: Any) -> int:
-        """What the exit code of `ros2` becomes."""
+        """Run the verb; return the exit code for `ros2`."""
         return _run(args.arguments or ["--help"])
 
 

@@ -1,7 +1,8 @@
 """Which back ends this machine offers; choosing and making one; the back end `fifo`.
 
-**scx** and **litmus** gate in the kernel, to the microsecond; **freezer** with a dispatcher on any
-kernel, to some tens of microseconds; **fifo** isolates, and leaves gating to the shaping node.
+* **scx** and **litmus** gate in the kernel, exactly to some microseconds.
+* **freezer** gates by a dispatcher on any kernel, exactly to some tens of microseconds.
+* **fifo** isolates threads, and leaves gating to the shaping node.
 """
 
 import os
@@ -22,11 +23,11 @@ from chainshaper.values.errors import InputError, PlatformError
 
 @dataclass(frozen=True)
 class Offer:
-    """A back end and why it cannot be used here; ``missing`` is None where it can."""
+    """A back end, and whether it can be used here."""
 
     name: str
-    strength: str
-    missing: str | None
+    strength: str  # what it does, in words
+    missing: str | None  # why it cannot be used here; None: it can
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Choice:
 
 
 def offered_back_ends() -> tuple[Offer, ...]:
-    """All back ends, strongest first, with what is missing for them on this machine."""
+    """Return all back ends, strongest first, with what is missing for them on this machine."""
     return tuple(Offer(name, strength, missing()) for name, (strength, missing) in _KNOWN.items())
 
 
@@ -76,9 +77,10 @@ def gates(name: str) -> bool:
 def make_back_end(
     name: str, table: ServerTable, journal: Journal, go_on: Callable[[], None] = lambda: None
 ) -> BackEnd:
-    """Make a back end for a table. ``go_on`` is called while processes start, and may raise.
+    """Make a back end for a table.
 
-    Raises InputError: the table is more than the back end can do. And as the back end.
+    ``go_on`` is called while processes start, and may raise an exception. Raises InputError: the
+    back end cannot have such a table. And as the back end.
     """
     match name:
         case "scx":

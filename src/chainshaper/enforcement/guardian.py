@@ -2,15 +2,15 @@
 
     python -m chainshaper.enforcement.guardian FOLDER
 
-Every run has two, in case one is killed or stopped at the same instant as what they watch over.
-They learn of a death from a pidfd, at once, and of a dispatcher that hangs from its sign of life;
-then they undo all that the journal says. Each has a session and a cgroup of its own, and a priority
-above the dispatchers' where it shares a core with one. On its standard output it says when it
-watches.
+Every run has two guardians, in case one is killed or stopped at the same instant as the owner or a
+dispatcher. They learn from a pidfd at once that a process has ended, and from its signs of life
+that a dispatcher hangs; then they undo all that the journal names. Each has a session and a cgroup
+of its own, and a priority above the dispatchers' where it shares a core with one. On its standard
+output it says when it watches.
 
-A dispatcher without a sign of life for a tenth of a second may hang, or its core may have been
-taken from the machine for a moment: its threads are let go. One that stays away for half a second
-has failed. Looks are counted, not time: that a machine stalls as a whole is no fault.
+A dispatcher that gives no sign of life for a tenth of a second may hang, or the host may have taken
+its core for a moment: its threads are let go. After half a second it has failed. Guardians count
+their looks instead of the time, so that a stall of the whole machine is not taken for a failure.
 """
 
 import contextlib
@@ -41,20 +41,20 @@ from chainshaper.linux.threads import open_process
 from chainshaper.values.errors import OperationError
 
 GROUP = "chainshaper.guardians"
-_HOW_MANY = 2
+_GUARDIANS = 2
 _PRIORITY = 98
 _ELSEWHERE_PRIORITY = 88
 """On cores without a dispatcher: above all servers, below DDS, whose outputs looks would delay."""
-_LOOK_S = 0.02
+_LOOK_S = 0.02  # between two looks at the dispatchers
 _LOOKS_UNTIL_THAWED = 4
 _LOOKS_UNTIL_HUNG = 24
-_IDLE_S = 1.0  # where no dispatcher is known: looks delay others
-_LOOKS_AT_ONCE = 5  # between two at the journal, which can wait
-_START_S = 20.0
+_IDLE_S = 1.0  # between two looks where no dispatcher is known, since a look delays other threads
+_LOOKS_AT_ONCE = 5  # looks at the dispatchers for each look at the journal
+_START_S = 20.0  # how long a guardian may take to start
 
 
 class Guardians:
-    """The guardians of a run, as its owner has them; making them starts them."""
+    """The guardians of a run, which are started when this is made."""
 
     def __init__(self, journal: Journal) -> None:
         self.journal = journal
@@ -62,27 +62,35 @@ class Guardians:
         self.renew()
 
     def renew(self) -> None:
-        """Start anew those that are lost."""
-        for lost in [one for one in self.processes if what_happened(one) is not None]:
-            lost.kill()
-            lost.communicate()
-            self.processes.remove(lost)
-        while len(self.processes) < _HOW_MANY:
+        """Replace the guardians that have ended or were stopped."""
+        lost = [guardian for guardian in self.processes if what_happened(guardian) is not None]
+        for guardian in lost:
+            guardian.kill()
+            guardian.communicate()
+            self.processes.remove(guardian)
+        while len(self.processes) < _GUARDIANS:
             folder = str(self.journal.path.parent)
             self.processes.append(start_module(__name__, folder, stderr=subprocess.DEVNULL))
 
     def await_ready(self, go_on: Callable[[], None] = lambda: None) -> None:
-        """Until they watch; ``go_on`` may raise. Raises OperationError: one does not start."""
-        for pipe in [one.stdout for one in self.processes if one.stdout is not None]:
+        """Wait until all guardians watch.
+
+        ``go_on`` is called meanwhile, and may raise an exception. Raises OperationError: a guardian
+        does not start.
+        """
+        pipes = [guardian.stdout for guardian in self.processes if guardian.stdout is not None]
+        for pipe in pipes:
             looks = int(_START_S / _LOOK_S)
-            while looks and not select.select([pipe], [], [], _LOOK_S)[0]:  # it says so, or ends
+            while (
+                looks and not select.select([pipe], [], [], _LOOK_S)[0]
+            ):  # it writes, or has ended
                 go_on()
                 looks -= 1
             if not looks or not pipe.read(1):
                 raise OperationError("a guardian does not start: is the machine overloaded?")
 
     def end(self) -> None:
-        """Kill them, when there is nothing left to undo."""
+        """Kill the guardians, when there is nothing left to undo."""
         for process in self.processes:
             process.kill()
         for process in self.processes:
@@ -94,8 +102,10 @@ class Guardians:
 def run_claimed(
     cores: Collection[int], nodes: Collection[str], folder: Path | None = None
 ) -> Iterator[Journal]:
-    """A run that governs these, watched over: all in its journal is as before when it is over.
-    Raises: as :func:`.claim_run` and :meth:`Guardians.await_ready`; or not all could be put back.
+    """Claim a run with guardians for the context; at its end, undo all that the journal names.
+
+    Raises OperationError: not all could be put back; and as :func:`.claim_run` and
+    :meth:`Guardians.await_ready`.
     """
     journal = claim_run(cores, nodes, folder)
     guardians = None
@@ -108,7 +118,10 @@ def run_claimed(
 
 
 def put_back(journal: Journal, guardians: Guardians | None, problems: Iterable[str] = ()) -> None:
-    """End a run of ours. Raises OperationError: not all could be put back, or ``problems``."""
+    """Undo and end a run, as its owner.
+
+    Raises OperationError: not all could be put back, or there are ``problems``, which are said.
+    """
     left = (*problems, *undo_run(journal, by_owner=True), *strange_lines(journal))
     if guardians is not None:
         guardians.end()
@@ -120,20 +133,20 @@ def put_back(journal: Journal, guardians: Guardians | None, problems: Iterable[s
 
 
 class _Watch:
-    """What a guardian sees. ``owner`` is a pidfd."""
+    """Watches the owner of a run, given by a pidfd, and the run's dispatchers."""
 
     def __init__(self, owner: int, journal: Journal) -> None:
         self.owner, self.journal = owner, journal
-        self.available = os.sched_getaffinity(0)
-        self.read_until = -1
+        self.available = os.sched_getaffinity(0)  # cores
+        self.read_until = -1  # the size of the journal when it was read last
         self.page: CounterPage | None = None
-        self.cores: dict[int, int] = {}  # by pidfd of its dispatcher
-        self.beats: dict[int, tuple[int, int]] = {}  # by core: the last one, and how often seen
+        self.cores: dict[int, int] = {}  # by the pidfd of the core's dispatcher
+        self.beats: dict[int, tuple[int, int]] = {}  # by core: the last value; how often seen again
         self.poll = select.poll()
         self.poll.register(owner, select.POLLIN)
 
     def run(self) -> bool:
-        """Until something is lost, or the run is over: whether there is something to undo."""
+        """Watch until a process is lost (returns True), or the run is over (returns False)."""
         while self.journal_is_there():
             lost = self.look_for_dispatchers()
             for _ in range(_LOOKS_AT_ONCE):
@@ -149,12 +162,13 @@ class _Watch:
         return False
 
     def journal_is_there(self) -> bool:
+        """Return whether the run has a journal still; without, it is over."""
         with contextlib.suppress(OSError):
             return self.journal.keep()
-        return True  # in memory: its folder is gone, and there is no room for another
+        return True  # its folder is gone and cannot be made anew, but the journal is in memory
 
     def look_for_dispatchers(self) -> bool:
-        """Learn of new ones; whether one of them has ended already."""
+        """Look for new dispatchers in the journal; return whether one has ended already."""
         if self.page is not None and self.beats.keys() >= self.page.cores.keys():
             return False  # all are known
         lost, size = False, self.journal.size()
@@ -165,7 +179,7 @@ class _Watch:
         if self.page is None:
             try:
                 self.page = CounterPage(run.page, run.table)
-            except OSError:  # the owner is gone, which its pidfd will say
+            except OSError:  # the owner has ended, as its pidfd will say
                 return False
         for dispatcher in processes_of_role(self.journal, DISPATCHER):
             if dispatcher.core is None or dispatcher.core in self.beats:
@@ -182,29 +196,33 @@ class _Watch:
         return lost
 
     def forget_dispatchers(self) -> None:
+        """Watch the dispatchers known so far no more."""
         for pidfd in self.cores:
             self.poll.unregister(pidfd)
             os.close(pidfd)
         self.cores.clear()
 
     def hangs(self, page: CounterPage) -> bool:
-        """Whether a dispatcher does; threads of one that may are let go."""
+        """Return whether a dispatcher hangs; let go the threads of each that may hang."""
         for core in self.cores.values():
-            beat, (last, still) = page.cores[core].beats, self.beats[core]
-            still = still + 1 if beat == last else 0
-            self.beats[core] = (beat, still)
+            beat, (last_beat, looks) = page.cores[core].beats, self.beats[core]
+            looks = looks + 1 if beat == last_beat else 0
+            self.beats[core] = (beat, looks)
             if beat == 0:
-                continue  # it starts; the owner waits for it
-            if still == _LOOKS_UNTIL_THAWED:
+                continue  # it still starts, and the owner waits for it
+            if looks == _LOOKS_UNTIL_THAWED:
                 let_go(self.journal, page, core)
-            if still >= _LOOKS_UNTIL_HUNG:
+            if looks >= _LOOKS_UNTIL_HUNG:
                 page.cores[core].silent = 1
                 return True
         return False
 
 
 def let_go(journal: Journal, page: CounterPage, core: int) -> None:
-    """Thaw the threads of all servers of a core; a dispatcher that is back by then sees it."""
+    """Thaw the threads of all servers of a core, and note it for the core's dispatcher.
+
+    If that works again by then, it closes the servers again.
+    """
     thaw(groups_of(run_of(journal), core))
     page.cores[core].let_go = time.monotonic_ns()
 
@@ -217,7 +235,7 @@ def main() -> None:
         journal = remembered_journal(Path(sys.argv[1], JOURNAL_FILE))
     except OSError:
         return  # the run is over already
-    with contextlib.suppress(OperationError):  # a full disk: it watches all the same
+    with contextlib.suppress(OperationError):  # a full disk is no reason not to watch
         note_process(journal, GUARDIAN, os.getpid())
     cgroups.enter_own_group(GROUP)
     try:

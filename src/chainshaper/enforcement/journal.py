@@ -1,9 +1,14 @@
 """The journal of each run: what it has changed on this machine, and which processes it governs.
 
-A run has a folder (:func:`journals_folder`), gone when the machine boots again, as is all that was
-changed. In it are `journal.jsonl`, `run.json`, which the run writes anew every second, and
-`plan.json`. Whatever ends us, SIGKILL included, another process must be able to put things back:
-each change is one line of JSON, on the disk (`fsync`) before it is made.
+A run has a folder (:func:`journals_folder`) with three files:
+
+* `journal.jsonl`: the journal;
+* `run.json`: the run's state, which it writes anew every second;
+* `plan.json`: the plan that it puts in force.
+
+Whatever ends the run, SIGKILL included, another process must be able to undo its changes. So each
+change is a line of JSON in the journal, and that line is on the disk (`fsync`) before the change is
+made. The folder is gone after the next boot, as are all changes.
 """
 
 import contextlib
@@ -35,9 +40,9 @@ _T = TypeVar("_T")
 
 JOURNAL_FILE, STATE_FILE, PLAN_FILE = "journal.jsonl", "run.json", "plan.json"
 FORMAT = 1
-OPENED, PROCESS = "opened", "process"
-GUARDIAN, DISPATCHER = "guardian", "dispatcher"
-_LOOK_S = 0.02
+OPENED, PROCESS = "opened", "process"  # kinds of entries
+GUARDIAN, DISPATCHER = "guardian", "dispatcher"  # roles of a run's processes
+_LOOK_S = 0.02  # between two attempts to lock a folder
 _LOCK = ".lock"
 _NO_LINK = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
@@ -52,8 +57,8 @@ class Journal:
     def note(self, kind: str, *changes: Mapping[str, Any], **fields: Any) -> None:
         """Write down, with one `fsync`, how to undo changes that are about to be made.
 
-        Without ``changes`` it is one, of these ``fields``. Raises OperationError: they cannot be
-        written; make no change then.
+        Each of the ``changes`` is an entry of this kind; without them, the ``fields`` are one
+        entry. Raises OperationError: they cannot be written; make no change then.
         """
         entries = [{"kind": kind, **change} for change in changes or (fields,)]
         lines = b"".join(json.dumps(entry).encode() + b"\n" for entry in entries)
@@ -76,7 +81,7 @@ class Journal:
             ) from error
 
     def entries(self, kind: str | None = None) -> tuple[Mapping[str, Any], ...]:
-        """All that was noted (of a ``kind``), oldest first.
+        """Return the entries (of a ``kind``), oldest first.
 
         A line that a crash cut off is left out: its change was not made. Raises OperationError: the
         journal cannot be read.
@@ -85,14 +90,20 @@ class Journal:
         return tuple(entry for entry in entries if entry and kind in (None, entry["kind"]))
 
     def read(self, kind: str, reader: Callable[[Mapping[str, Any]], _T]) -> tuple[_T, ...]:
-        """The entries of a kind as values; one that ``reader`` cannot make sense of is left out."""
+        """Return the entries of a kind, as values that ``reader`` makes of them.
+
+        An entry is left out if ``reader`` raises an error that bad data cause.
+        """
         values = (_value(entry, reader) for entry in self.entries(kind))
         return tuple(value for value in values if value is not None)
 
     def strange_lines(
         self, readers: Mapping[str, Callable[[Mapping[str, Any]], object]]
     ) -> Iterator[tuple[int, str]]:
-        """Lines, with their numbers, that are no entries, or that none of these could read."""
+        """Yield the lines that cannot be read, with their numbers.
+
+        Such a line is no entry, or of a kind without a reader, or its reader refuses it.
+        """
         for number, line in enumerate(self._lines(), start=1):
             entry = _entry(line)
             reader = readers.get(entry["kind"]) if entry else None
@@ -100,7 +111,10 @@ class Journal:
                 yield number, line
 
     def keep(self) -> bool:
-        """Write the file again from ``memory`` if it is gone; False: it was discarded."""
+        """Write the file again from ``memory`` if it was removed; return whether there is one.
+
+        There is none if the journal was discarded (:func:`discard_journal`).
+        """
         if self.memory is None or self.memory.closed:
             return self.path.exists()
         if not self.path.exists():
@@ -124,7 +138,7 @@ class Journal:
         return True
 
     def size(self) -> int:
-        """The size of the journal in bytes: it only grows."""
+        """Return the size of the journal in bytes: it only grows."""
         with contextlib.suppress(OSError):
             return self.path.stat().st_size
         return len(self._remembered())
@@ -135,19 +149,19 @@ class Journal:
 
     @property
     def outdated(self) -> bool:
-        """Whether the machine has booted since: then nothing of it is left to undo."""
+        """Whether the machine has booted since it was opened: then nothing is left to undo."""
         opened = self.entries(OPENED)
         return bool(opened) and opened[0].get("boot_id") != boot_id()
 
     @property
     def owner(self) -> int | None:
-        """The process that opened it and still lives; None when it is gone."""
+        """The id of the process that opened the journal; None: that process has ended."""
         opened = self.read(OPENED, process_of)
         gone = not opened or self.outdated or has_ended(*opened[0])
         return None if gone else opened[0][0]
 
     def open_owner(self) -> int | None:
-        """A pidfd of the owner, None when it is gone."""
+        """Open a pidfd of the owner; None: it has ended."""
         return None if self.owner is None else open_process(*self.read(OPENED, process_of)[0])
 
     def _lines(self) -> list[str]:
@@ -167,12 +181,12 @@ class Journal:
 
 
 def process_of(entry: Mapping[str, Any]) -> tuple[int, int]:
-    """The process that an entry names: its id, and when it started."""
+    """Return the process that an entry names: its id, and when it started (ticks after boot)."""
     return int(entry["pid"]), int(entry["started"])
 
 
-class OwnProcess(NamedTuple):
-    """A process of a run, as its journal has it."""
+class HelperProcess(NamedTuple):
+    """A process that a run has started to keep its plan in force, as its journal names it."""
 
     role: str  # GUARDIAN or DISPATCHER
     pid: int
@@ -181,23 +195,26 @@ class OwnProcess(NamedTuple):
 
 
 def note_process(journal: Journal, role: str, pid: int, core: int | None = None) -> None:
-    """Write down a process of the run, unless it has ended."""
+    """Write down a process that helps the run, unless it has ended."""
     if (started := start_of(pid, pid)) is not None:
         journal.note(PROCESS, role=role, pid=pid, started=started, core=core)
 
 
-def read_process(entry: Mapping[str, Any]) -> OwnProcess:
-    return OwnProcess(str(entry["role"]), *process_of(entry), entry["core"])
+def read_process(entry: Mapping[str, Any]) -> HelperProcess:
+    """Make a helper process of a journal's entry."""
+    pid, started = process_of(entry)
+    return HelperProcess(str(entry["role"]), pid, started, entry["core"])
 
 
-def processes_of_role(journal: Journal, role: str) -> tuple[OwnProcess, ...]:
-    """All processes of a role that the run has ever had."""
+def processes_of_role(journal: Journal, role: str) -> tuple[HelperProcess, ...]:
+    """Return all processes of a role that the run has ever had."""
     processes = journal.read(PROCESS, read_process)
     return tuple(process for process in processes if process.role == role)
 
 
 @functools.lru_cache(maxsize=8192)  # a run reads its journal often, and lines never change
 def _entry(line: str) -> Mapping[str, Any] | None:
+    """Read a line of a journal; None: it is no entry."""
     try:
         entry = json.loads(line)
         return entry if isinstance(entry["kind"], str) else None
@@ -206,6 +223,7 @@ def _entry(line: str) -> Mapping[str, Any] | None:
 
 
 def _value(entry: Mapping[str, Any], reader: Callable[[Mapping[str, Any]], _T]) -> _T | None:
+    """Make a value of an entry; None: the entry is not what ``reader`` expects."""
     try:
         return reader(entry)
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError):
@@ -213,9 +231,10 @@ def _value(entry: Mapping[str, Any], reader: Callable[[Mapping[str, Any]], _T]) 
 
 
 def open_journal(folder: str | Path | None = None, run: str | None = None) -> Journal:
-    """Begin a journal in ``folder``/``run``; both have defaults.
+    """Begin the journal of a run in ``folder``/``run``; both have defaults.
 
-    Raises OperationError: there is one, or it cannot be written. PlatformError: no folder for it.
+    Raises OperationError: there is a journal already, or it cannot be written. PlatformError: as
+    :func:`journals_folder`.
     """
     base = journals_folder(folder)
     place = base / (run or f"{time.strftime('%Y%m%dT%H%M%S')}-{os.getpid()}")
@@ -241,12 +260,18 @@ def open_journal(folder: str | Path | None = None, run: str | None = None) -> Jo
 
 
 def remembered_journal(path: Path) -> Journal:
-    """The journal at a path, open for :meth:`Journal.keep`. Raises OSError: there is none."""
+    """Open the journal at a path, so that :meth:`Journal.keep` can write it again.
+
+    Raises OSError: there is none.
+    """
     return Journal(path, FileIO(os.open(path, os.O_RDONLY | _NO_LINK), "r"))
 
 
 def journals_folder(named: str | Path | None = None) -> Path:
-    """Where runs have their folders. Raises PlatformError: no root, and no session of a user."""
+    """Return the folder in which runs have theirs: the one that is ``named``, or the default.
+
+    Raises PlatformError: no default, since we are not root and not in a session of a user.
+    """
     if named is not None:
         return Path(named)
     if os.geteuid() == 0:
@@ -259,16 +284,19 @@ def journals_folder(named: str | Path | None = None) -> Path:
 
 
 def find_journals(folder: str | Path | None = None) -> tuple[Journal, ...]:
-    """All journals that have not been discarded, oldest name first."""
+    """Return all journals that have not been discarded, in the order of their names."""
     return tuple(
         Journal(path) for path in sorted(journals_folder(folder).glob(f"*/{JOURNAL_FILE}"))
     )
 
 
 def discard_journal(journal: Journal) -> None:
-    """Remove a journal when all is undone. Emptied first: who has it open knows then."""
+    """Remove a journal when all is undone.
+
+    It is emptied first, so that processes that have it open know that it was discarded.
+    """
     with contextlib.suppress(FileNotFoundError):
-        with contextlib.suppress(OSError):  # a link: who has it open has no journal of ours
+        with contextlib.suppress(OSError):  # a link: nobody has what it leads to open as a journal
             descriptor = os.open(journal.path, os.O_WRONLY | _NO_LINK)
             os.ftruncate(descriptor, 0)
             os.close(descriptor)
@@ -280,6 +308,7 @@ def discard_journal(journal: Journal) -> None:
 
 
 def boot_id() -> str:
+    """Return the id that the kernel has given itself when it booted."""
     return text_of(read_proc("/proc/sys/kernel/random/boot_id")).strip()
 
 
@@ -288,12 +317,15 @@ class LockHolder(NamedTuple):
 
     pid: int
     started: int  # ticks after the machine booted
-    user: int | None  # None: no single user's
+    user: int | None  # None: it is of no single user, or has ended
 
 
 Waiting: TypeAlias = Callable[[LockHolder | None, float], None]
-"""Called while a folder is locked, with the process that has locked it (None: not known), and how
-long we have waited for that process (s); may raise."""
+"""A function that is called again and again while another process has a folder locked.
+
+Its arguments are that process (None: not known), and the seconds for which we have waited for it.
+It may raise an exception to end the wait.
+"""
 
 
 @contextlib.contextmanager
@@ -314,29 +346,31 @@ def locked(folder: Path, waiting: Waiting) -> Iterator[None]:
 def all_runs_locked(base: Path, waiting: Waiting) -> Iterator[None]:
     """Lock the folder of all runs until the context ends; see :func:`locked`.
 
-    Other users may read that folder, and so could lock it. So the lock is a folder in it, of a mode
-    that keeps them out; it is removed when no process has it.
+    Other users may read that folder, so they could lock it. Therefore a folder inside it is locked
+    instead, whose mode keeps them out. It is removed at the end, unless another process waits.
     """
-    place = base / _LOCK
+    lock_folder = base / _LOCK
     with contextlib.ExitStack() as stack:
         while True:
-            with contextlib.suppress(FileNotFoundError):  # who had it has just removed it
-                place.mkdir(mode=0o700, exist_ok=True)
-                stack.enter_context(locked(place, waiting))
+            with contextlib.suppress(FileNotFoundError):  # the last holder has just removed it
+                lock_folder.mkdir(mode=0o700, exist_ok=True)
+                stack.enter_context(locked(lock_folder, waiting))
                 break
         try:
             yield
         finally:
             with contextlib.suppress(OSError):
-                place.rmdir()
+                lock_folder.rmdir()
 
 
 def _lock(folder: Path, waiting: Waiting) -> int:
+    """Lock a folder; return the descriptor that holds the lock until it is closed."""
     while True:
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
         try:
             _wait_for_lock(descriptor, folder, waiting)
-            if os.path.samestat(os.fstat(descriptor), folder.lstat()):  # it was not made anew
+            # It may have been removed and made anew while we waited.
+            if os.path.samestat(os.fstat(descriptor), folder.lstat()):
                 return descriptor
         except BaseException:
             os.close(descriptor)
@@ -363,17 +397,17 @@ def _wait_for_lock(descriptor: int, folder: Path, waiting: Waiting) -> None:
 
 
 def _holder_of(descriptor: int) -> LockHolder | None:
-    """The process that has an open folder locked, as far as the kernel shows it (proc_locks(5)).
+    """Return the process that has an open folder locked; None: the kernel does not show it.
 
-    Inodes of other devices have the same numbers; and the kernel names who asked for the lock: that
-    number may be another's since, unless it has the folder open.
+    The kernel (proc_locks(5)) names the process that asked for the lock. That process may have
+    ended since, and its id may be another's; so it counts only if it has the folder open.
     """
     state = os.fstat(descriptor)
-    place = b"%02x:%02x:%d" % (os.major(state.st_dev), os.minor(state.st_dev), state.st_ino)
+    inode = b"%02x:%02x:%d" % (os.major(state.st_dev), os.minor(state.st_dev), state.st_ino)
     with contextlib.suppress(OSError):
         for line in lines_of(read_proc("/proc/locks")):
             fields = line.split()
-            if fields[1:2] != [b"FLOCK"] or fields[5] != place or int(fields[4]) <= 0:
+            if fields[1:2] != [b"FLOCK"] or fields[5] != inode or int(fields[4]) <= 0:
                 continue
             pid = int(fields[4])
             started = start_of(pid, pid)
@@ -383,6 +417,7 @@ def _holder_of(descriptor: int) -> LockHolder | None:
 
 
 def _has_open(pid: int, state: os.stat_result) -> bool:
+    """Whether a process has a file or folder open, which is known by its device and inode."""
     with contextlib.suppress(OSError):
         for entry in Path(f"/proc/{pid}/fd").iterdir():
             with contextlib.suppress(OSError):  # closed meanwhile
@@ -393,13 +428,13 @@ def _has_open(pid: int, state: os.stat_result) -> bool:
 
 @dataclass(frozen=True)
 class Governed:
-    """A run that governs processes; instants are ns of CLOCK_MONOTONIC."""
+    """A run that governs processes, and the time in which it did; instants of CLOCK_MONOTONIC."""
 
     run: str  # its name
     since_ns: int  # when its first whole cycle began
     seen_ns: int  # when it was seen last
-    until_ns: int | None  # when it ended (None: not seen to)
-    plan: dict[str, Any] | None
+    until_ns: int | None  # when it ended; None: it has not, as far as was seen
+    plan: dict[str, Any] | None  # the content of its plan file; None: it could not be read
 
 
 def governing(
@@ -408,7 +443,11 @@ def governing(
     before: Collection[Governed] = (),
     folder: Path | None = None,
 ) -> tuple[Governed, ...]:
-    """The runs that govern threads of these processes; one seen ``before`` and gone has ended."""
+    """Return the runs that govern threads of these processes now, or did at an earlier look.
+
+    ``before`` is what an earlier look returned. A run of it that is gone ended when it was seen
+    last.
+    """
     known = {governed.run: governed for governed in before}
     runs: dict[str, Governed] = {}
     for governed in before:
@@ -434,10 +473,10 @@ def governing(
 
 
 def in_force_throughout(runs: Collection[Governed]) -> Governed | None:
-    """Join runs into one, of the time in which all were in force together.
+    """Join runs into one, in force while all of them were; None: there was no run.
 
-    Of runs that followed each other it is the last. It has a plan if it is of a single run. None:
-    there was no run.
+    Of runs that followed each other only the last counts. The result has a plan only if it is
+    one run's.
     """
     if not runs:
         return None
@@ -450,6 +489,7 @@ def in_force_throughout(runs: Collection[Governed]) -> Governed | None:
 
 
 def _plain(path: Path) -> dict[str, Any] | None:
+    """Read a file of JSON with an object in it; None: there is none."""
     with contextlib.suppress(OSError, ValueError):
         content = json.loads(read_regular(path))
         return content if isinstance(content, dict) else None

@@ -1,16 +1,16 @@
 """The back end `litmus`: the paper's own servers, where the kernel is LITMUS^RT.
 
-The P-RES plugin implements table-driven reservations (paper, section 2.2.1). All is done by the
-tools that come with LITMUS^RT, with commands that can be printed instead.
+The P-RES plugin implements table-driven reservations (paper, section 2.2.1). All is done with the
+tools of LITMUS^RT, by commands that can be printed instead.
 
-A reservation cannot be changed, listed or deleted by itself: all go when the plugin is changed,
-which the kernel refuses while a thread is under SCHED_LITMUS. Another anchor makes new
-reservations, and each thread moves by itself: for the two milliseconds that a command takes, it
-runs freely. Threads are attached one by one, after those of DDS exist, since what a thread creates
-runs in its reservation, too; they are detached by giving them another class.
-
-Intervals are half-open, since `resctl` takes `[2,86] [86,87]` for overlapping, ascend, and count
-from time zero of CLOCK_MONOTONIC: another anchor turns the slots.
+* A reservation cannot be changed, listed or deleted. All are deleted together when another plugin
+  is activated, which the kernel refuses while a thread is under SCHED_LITMUS. So another anchor
+  makes new reservations, to which threads move one by one. Each runs freely for the two
+  milliseconds that its command takes.
+* Threads are attached one by one, and after DDS has created its threads, since a new thread runs in
+  the reservation of the thread that created it. They are detached by giving them another class.
+* Intervals ascend and are half-open, since `resctl` takes `[2,86] [86,87]` for overlapping. They
+  count from time zero of CLOCK_MONOTONIC, so slots are turned by the anchor (:func:`turned`).
 
 Upstream: liblitmus, `bin/resctl.c`, `doc/howto-use-resctl.md`, `doc/table-driven-scheduling.md`;
 LITMUS^RT, `litmus/reservations/alloc.c`.
@@ -38,15 +38,15 @@ NOTE = "litmus-plugin"
 Command = tuple[str, ...]
 SCHED_LITMUS = 7
 _PROC = Path("/proc/litmus")
-_COMMAND_S = 10.0
-_MOST_INTERVALS = 1024
-_SHORTEST_NS = 2
+_COMMAND_S = 10.0  # how long a command may take
+_MOST_INTERVALS = 1024  # of a reservation
+_SHORTEST_NS = 2  # interval
 _PLUGIN = "P-RES"
 _NO_PLUGIN = "Linux"
 
 
 def missing(proc: Path = _PROC) -> str | None:
-    """Why the kernel has no LITMUS^RT servers, with the remedy; None when it has."""
+    """Say why the kernel has no LITMUS^RT servers, with the remedy; None: it has them."""
     if proc.is_dir():
         return None
     return (
@@ -56,9 +56,10 @@ def missing(proc: Path = _PROC) -> str | None:
 
 
 class Litmus(BackEnd):
-    """A table of servers in force as reservations; see :class:`.servers.BackEnd`. Raises
-    PlatformError: the kernel is not LITMUS^RT, or its tools are not installed. OperationError:
-    others use the plugin. InputError: the table has what LITMUS^RT cannot do.
+    """A table of servers in force as reservations; see :class:`.servers.BackEnd`.
+
+    Raises PlatformError: the kernel is not LITMUS^RT, or its tools are not installed.
+    OperationError: another program uses the plugin. InputError: as :func:`litmus_commands`.
     """
 
     def __init__(self, table: ServerTable, journal: Journal, proc: Path = _PROC) -> None:
@@ -72,13 +73,13 @@ class Litmus(BackEnd):
                 f"the plugin {_PLUGIN} is active already, perhaps with others' reservations, which"
                 f" go with ours: when they are not needed, `setsched {_NO_PLUGIN}`"
             )
-        litmus_commands(table, {}, anchor_ns=0)
+        litmus_commands(table, {}, anchor_ns=0)  # raises InputError for a table that cannot be
         super().__init__(table)
         self._journal = journal
         self._proc = proc
-        self._members: dict[int, ReservationServer] = {}
-        self._ids: dict[str, int] = {}
-        self._generation = 0
+        self._members: dict[int, ReservationServer] = {}  # by thread id
+        self._ids: dict[str, int] = {}  # of reservations, by server name; empty before `arm`
+        self._generation = 0  # how often reservations were made
 
     def assign(self, tid: int, server: str, place: int = 0) -> None:  # noqa: ARG002 - turns
         self._members[tid] = server_named(self._table, server)
@@ -95,8 +96,9 @@ class Litmus(BackEnd):
         for server in self._table.servers:
             _run(create_command(ids[server.name], server, self._table.cycle_ns, anchor_ns))
         self._ids = ids
-        for thread in filter(None, map(find_thread, self._members if moving else ())):
-            apply_scheduling(thread, SchedulingRequest(0, None))
+        if moving:
+            for thread in filter(None, map(find_thread, self._members)):
+                apply_scheduling(thread, SchedulingRequest(0, None))
         self._attach(*self._members)
         self._since_ns = time.monotonic_ns()
 
@@ -111,6 +113,7 @@ class Litmus(BackEnd):
         restore_plugin(self._journal)
 
     def _attach(self, *tids: int) -> None:
+        """Attach threads to the reservations of their servers; ended ones are passed over."""
         reserved = SchedulingClass(SCHED_LITMUS, 0, reset_on_fork=False)
         changes = [
             (thread, partial(replace, scheduling_class=reserved, cores=(self._members[tid].core,)))
@@ -127,22 +130,28 @@ class Litmus(BackEnd):
 
 
 def read_note(entry: Mapping[str, Any]) -> tuple[str, Path]:
-    """A journal's entry as a value: the plugin before ours, and where LITMUS^RT shows itself."""
+    """Return what a journal's entry says: the plugin before ours, and LITMUS^RT's folder."""
     return str(entry["previous"]), Path(entry["proc"])
 
 
 def restore_plugin(journal: Journal) -> None:
-    """Activate the plugin that was active before ours, which the kernel refuses before all threads
-    are restored; harmless when repeated. Raises OperationError: it refuses.
+    """Activate the plugin that was active before ours; harmless when repeated.
+
+    To be called when all threads are restored. Raises OperationError: the kernel refuses, as it
+    does while one is under SCHED_LITMUS.
     """
-    for previous, proc in () if journal.outdated else journal.read(NOTE, read_note)[:1]:
-        if _active_plugin(proc) == _PLUGIN:
-            _run(("setsched", _NO_PLUGIN))
-            if previous != _NO_PLUGIN:
-                _run(("setsched", previous))
+    notes = journal.read(NOTE, read_note)
+    if journal.outdated or not notes:
+        return
+    previous, proc = notes[0]
+    if _active_plugin(proc) == _PLUGIN:
+        _run(("setsched", _NO_PLUGIN))
+        if previous != _NO_PLUGIN:
+            _run(("setsched", previous))
 
 
 def _active_plugin(proc: Path) -> str:
+    """Return the name of the active plugin. Raises PlatformError: it cannot be read."""
     try:
         return text_of(read_proc(proc / "active_plugin")).strip()
     except OSError as error:
@@ -152,7 +161,7 @@ def _active_plugin(proc: Path) -> str:
 
 
 def _run(command: Command) -> None:
-    """Run a command of LITMUS^RT's; its complaint becomes ours."""
+    """Run a command of LITMUS^RT. Raises OperationError: it fails, with what it said."""
     text = f"`{' '.join(command)}`"
     try:
         done = subprocess.run(
@@ -173,11 +182,15 @@ def _run(command: Command) -> None:
 def litmus_commands(
     table: ServerTable, members: Mapping[str, Sequence[int | str]], anchor_ns: int
 ) -> tuple[Command, ...]:
-    """All commands that put a table in force, in order; ``members`` are thread ids by server, or
-    texts for threads that do not run yet. Raises InputError: LITMUS^RT cannot do it.
+    """Return all commands that put a table in force, in order.
+
+    ``members`` are, by server, the ids of threads, or texts for threads that do not run yet. Raises
+    InputError: LITMUS^RT cannot have such a table.
     """
     ids, servers = _reservation_ids(table), table.servers
-    create = (create_command(ids[s.name], s, table.cycle_ns, anchor_ns) for s in servers)
+    create = (
+        create_command(ids[server.name], server, table.cycle_ns, anchor_ns) for server in servers
+    )
     attach = (
         _attach_command(tid, ids[server.name], server.core)
         for server in servers
@@ -187,15 +200,21 @@ def litmus_commands(
 
 
 def _reservation_ids(table: ServerTable, generation: int = 0) -> dict[str, int]:
-    """An id per server and core, `core x 1000 + index`, different in every generation."""
+    """Return an id for each server, `core x 1000 + index`, different in every generation."""
     first = generation * len(table.servers) + 1
-    return {s.name: s.core * 1000 + index for index, s in enumerate(table.servers, start=first)}
+    return {
+        server.name: server.core * 1000 + index
+        for index, server in enumerate(table.servers, start=first)
+    }
 
 
 def create_command(
     number: int, server: ReservationServer, cycle_ns: int, anchor_ns: int
 ) -> Command:
-    """A reservation with cycles from ``anchor_ns`` on. Raises InputError: it is refused."""
+    """Return the command that makes a reservation with cycles from ``anchor_ns`` on.
+
+    Raises InputError: the server has too many slots, or too short ones.
+    """
     slots = turned(server.slots, cycle_ns, anchor_ns)
     if len(slots) > _MOST_INTERVALS:
         most = f"LITMUS^RT takes {_MOST_INTERVALS}: use a shorter cycle, or another back end"
@@ -206,11 +225,9 @@ def create_command(
                 f"server {server.name}: the slot at {duration_text(start)} is shorter than "
                 f"{_SHORTEST_NS} ns, the least that LITMUS^RT takes: make it longer"
             )
-    return (
-        *("resctl", "-n", str(number), "-t", "table-driven", "-c", str(server.core)),
-        *("-m", milliseconds_text(cycle_ns), "-q", str(server.priority)),
-        *(f"[{milliseconds_text(start)},{milliseconds_text(end)})" for start, end in slots),
-    )
+    intervals = [f"[{milliseconds_text(start)},{milliseconds_text(end)})" for start, end in slots]
+    identified = ("resctl", "-n", str(number), "-t", "table-driven", "-c", str(server.core))
+    return (*identified, "-m", milliseconds_text(cycle_ns), "-q", str(server.priority), *intervals)
 
 
 def _attach_command(tid: int | str, number: int, core: int) -> Command:
@@ -218,8 +235,9 @@ def _attach_command(tid: int | str, number: int, core: int) -> Command:
 
 
 def milliseconds_text(duration_ns: int) -> str:
-    """The shortest decimal milliseconds that `resctl` turns into exactly this duration: it makes a
-    C double of them, multiplies it by a million and drops what is behind the point.
+    """Return the shortest text in milliseconds that `resctl` turns into exactly this duration.
+
+    `resctl` makes a C double of it, multiplies it by a million and drops the fraction.
 
     >>> milliseconds_text(86_500_000)
     '86.5'
@@ -234,8 +252,10 @@ def milliseconds_text(duration_ns: int) -> str:
 def turned(
     slots: Iterable[tuple[int, int]], cycle_ns: int, anchor_ns: int
 ) -> tuple[tuple[int, int], ...]:
-    """Slots that count from an anchor, counted from time zero instead; ascending. One across the
-    end of the cycle becomes two; a piece that the kernel refuses is left out.
+    """Return slots, counted from an anchor, as counted from time zero instead; ascending.
+
+    A slot across the end of the cycle becomes two. A piece that is too short for the kernel is left
+    out.
 
     >>> turned([(10, 30)], cycle_ns=100, anchor_ns=1080)
     ((0, 10), (90, 100))

@@ -1,11 +1,16 @@
 """Which node each thread of an application belongs to, and what it does there.
 
-Evidence for a thread's role, the stronger first: the callbacks that a recording saw it run; its
-name, by DDS; its place: executors spin on the main thread unless the program arranges it otherwise.
+A thread's role is known by, the strongest evidence first:
 
-Evidence for the nodes of a process, the stronger first: a recording of this very process, or of an
-earlier run of the same program; its command line (`--ros-args -r __node:=NAME`); the name of its
-program, which is a guess.
+1. the callbacks that it ran in a recording;
+2. its name, if DDS has given it one;
+3. its being the main thread: executors spin there unless the program arranges it otherwise.
+
+The nodes of a process are known by, the strongest evidence first:
+
+1. a recording of this very process, or of an earlier run of the same program;
+2. its command line (`--ros-args -r __node:=NAME`);
+3. the name of its program, which is a guess.
 """
 
 import time
@@ -35,8 +40,8 @@ from chainshaper.values.middleware import MIDDLEWARE_LIMITS, ROUTERS, Middleware
 
 IN_ORDER = "its executors are known by the order in which it started its threads, as when recorded"
 LEFT_ALONE = "left alone, since users run them whom this run does not name: "
-_MOST_NAMED = 5
-_COMM_LENGTH = 15  # the kernel cuts names of threads off behind this
+_MOST_NAMED = 5  # nodes or processes in a line
+_COMM_LENGTH = 15  # characters: the kernel cuts off what is longer in a thread's name
 
 
 @dataclass(frozen=True)
@@ -88,11 +93,11 @@ class _Identified(NamedTuple):
 
     process: RunningProcess
     nodes: tuple[str, ...] = ()
-    nodes_known_by: str = ""
-    # The threads of a recording, by the ids that they have in the process's pid namespace now
+    nodes_known_by: str = ""  # see NodeThread
+    # The recorded threads, by the ids that they have now in the process's pid namespace
     recorded: Mapping[int, RecordedThread] = MappingProxyType({})
-    in_order: bool = False  # the recording is one of an earlier run
-    main_executes: bool = True
+    in_order: bool = False  # whether threads were matched with those of an earlier run, by order
+    main_executes: bool = True  # whether the main thread may be an executor
 
 
 def allocate(
@@ -103,8 +108,8 @@ def allocate(
 ) -> Allocation:
     """Find out what each thread of ``processes`` does.
 
-    ``among`` are all processes that were looked at: who started whom tells a node from the commands
-    that run it. Processes of others than ``users`` have no nodes (None: all users' have).
+    ``among`` are all processes that were looked at: which of them started which tells a node from
+    the commands that run it. Only processes of ``users`` can have nodes (None: of all users).
     """
     looked_at = processes if among is None else among
     identified = [
@@ -170,7 +175,7 @@ def with_gates(allocation: Allocation, nodes: Iterable[ShapingNode]) -> Allocati
 def new_and_ended(
     before: Allocation, now: Allocation
 ) -> tuple[tuple[NodeThread, ...], tuple[NodeThread, ...]]:
-    """The threads that have appeared and those that are gone since an earlier look."""
+    """Return the threads that have appeared, and those that are gone, since an earlier look."""
     before_ids = {listed.thread.identity for listed in before.threads}
     now_ids = {listed.thread.identity for listed in now.threads}
     new = tuple(listed for listed in now.threads if listed.thread.identity not in before_ids)
@@ -183,7 +188,10 @@ def strangers_text(
     users: Collection[int],
     nodes: Collection[str] | None = None,
 ) -> str | None:
-    """One line about others' processes that carry a name of one of ``nodes`` (None: any node)."""
+    """Return a line about processes of users not in ``users`` that say they are nodes.
+
+    ``nodes`` are the names that matter; None: all.
+    """
     strangers = []
     for process in processes:
         if process.user in users:
@@ -208,9 +216,9 @@ def _identify(process: RunningProcess, recorded: Sequence[RecordedProcess]) -> _
     run = itself or namesake or _same_program(nodes, named, recorded)
     if run is None:
         return _Identified(process, nodes, known_by)
-    # A container's command line does not name its components, others' no node at all.
-    knows_better = itself or not namesake or (named and set(named) < set(run.nodes))
-    if knows_better and run.nodes:
+    # The command line of a container does not name its components, and many name no node at all.
+    recording_knows_more = itself or not namesake or (named and set(named) < set(run.nodes))
+    if recording_knows_more and run.nodes:
         nodes, known_by = run.nodes, "recording"
     if itself is None:
         threads = _in_order(process, run)
@@ -233,7 +241,10 @@ def _identify(process: RunningProcess, recorded: Sequence[RecordedProcess]) -> _
 def _same_program(
     guess: Sequence[str], named: Sequence[str], recorded: Sequence[RecordedProcess]
 ) -> RecordedProcess | None:
-    """The only earlier run of a program that names its nodes in its code, by its main thread."""
+    """Find the recorded run of a program that names its nodes in its code; None: not one only.
+
+    It is known by the name of its main thread, which is the program's.
+    """
     if named or not guess:
         return None
     main = guess[0][1:][:_COMM_LENGTH]
@@ -249,9 +260,9 @@ def _same_program(
 def _in_order(process: RunningProcess, earlier: RecordedProcess) -> dict[int, RecordedThread]:
     """Match the threads of a process with those of an earlier run; none if that is not sure.
 
-    A program starts its threads in the same order every time. So of the threads that have one name,
-    the first now is the first then, and so on, if there are as many. The match is needed only where
-    executors run beside the main thread.
+    A program starts its threads in the same order every time. So among threads of the same name,
+    the first now is the first then, and so on, if there are as many. Threads are matched only if
+    executors ran on others than the main thread.
     """
     executing = [thread for thread in earlier.threads if thread.role == "executor"]
     matched: dict[int, RecordedThread] = {}
@@ -262,7 +273,7 @@ def _in_order(process: RunningProcess, earlier: RecordedProcess) -> dict[int, Re
         now = [thread.inner_tid for thread in process.threads if thread.comm == name]
         if len(before) != len(now):
             return {}
-        # Ids ascend, and begin again at the lowest that is free.
+        # Ids ascend in order of start, but begin again at the lowest that is free.
         now.sort(key=lambda tid: (tid < process.inner_pid, tid))
         before.sort(key=lambda thread: (thread.tid < earlier.pid, thread.tid))
         matched |= zip(now, before, strict=True)
@@ -270,7 +281,7 @@ def _in_order(process: RunningProcess, earlier: RecordedProcess) -> dict[int, Re
 
 
 def _nodes_by_command(process: RunningProcess) -> tuple[tuple[str, ...], str]:
-    """The nodes that a process has by its command line, and which part of that says so."""
+    """Return the nodes of a process by its command line, and which part of that says so."""
     if named := named_nodes(process.command):
         return named, "command line"
     guess = guessed_name(process.command)
@@ -281,7 +292,7 @@ def _nodes_by_command(process: RunningProcess) -> tuple[tuple[str, ...], str]:
 
 
 def _is_same(process: RunningProcess, named: tuple[str, ...], seen: RecordedProcess) -> bool:
-    """Whether a process is the recorded one: it has its id, was alive then, has no other name."""
+    """Whether a process is the recorded one: it has the id, was alive then, has no other name."""
     pid = process.pid if seen.numbered_here else process.inner_pid
     if seen.pid != pid or not process.threads:
         return False
@@ -292,7 +303,7 @@ def _is_same(process: RunningProcess, named: tuple[str, ...], seen: RecordedProc
 
 
 def _claims(identified: Iterable[_Identified]) -> dict[str, list[int]]:
-    """The names that several processes have, and the ids of these."""
+    """Return the names that several processes have, with the ids of these processes."""
     claims: dict[str, list[int]] = {}
     for known in identified:
         for name in known.nodes:
@@ -301,10 +312,10 @@ def _claims(identified: Iterable[_Identified]) -> dict[str, list[int]]:
 
 
 def _with_unique_names(identified: list[_Identified]) -> list[_Identified]:
-    """Take a node's name from processes that carry it for another one.
+    """Take a node's name from the commands that run the node, such as `ros2 run`.
 
-    The node takes part in DDS or, if none does, is the innermost process (`ros2 run` and the like
-    start it).
+    Of several processes with a name, the node is the one that takes part in DDS; if none does, it
+    is the innermost one, which the others have started.
     """
     parent_of = {known.process.pid: known.process.parent for known in identified}
     participants = {known.process.pid for known in identified if known.process.participates}
@@ -322,7 +333,7 @@ def _with_unique_names(identified: list[_Identified]) -> list[_Identified]:
 
 
 def _threads_of(known: _Identified) -> Iterable[NodeThread]:
-    """The threads of a process, with their roles."""
+    """Yield the threads of a process, with their roles."""
     for thread in known.process.threads:
         nodes, role, known_by = known.nodes, thread.role, ""
         recorded = known.recorded.get(thread.inner_tid)

@@ -1,4 +1,4 @@
-"""Which running threads the servers of a plan mean, and which of them begins a chain."""
+"""Find the running threads that belong into the servers of a plan."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
@@ -11,7 +11,7 @@ NOT_RECOGNISED = "not running, or not recognised: "
 
 
 def server_members(plan: Plan, allocation: Allocation) -> dict[str, tuple[NodeThread, ...]]:
-    """The running threads of each server of a plan, by the server's name.
+    """Return the running threads of each server of a plan, by the server's name.
 
     Raises OperationError: a planned thread is not running, two processes are the same node, or one
     thread executes nodes of two servers.
@@ -36,7 +36,7 @@ def server_members(plan: Plan, allocation: Allocation) -> dict[str, tuple[NodeTh
 
 
 def threads_for(planned: Thread, allocation: Allocation) -> list[NodeThread]:
-    """The running threads that a plan's thread means.
+    """Return the running threads that a thread of a plan stands for.
 
     Raises OperationError: as :func:`server_members`.
     """
@@ -80,7 +80,7 @@ def threads_for(planned: Thread, allocation: Allocation) -> list[NodeThread]:
 
 
 def absent_receivers(nodes: Iterable[ShapingNode], running: Collection[str]) -> str | None:
-    """A line about receivers of outputs that are not among the nodes that run."""
+    """Return a line about receivers of outputs that do not run; None: all do."""
     absent = [
         f"{receiver}, which receives {node.output}"
         for node in nodes
@@ -98,7 +98,10 @@ def absent_receivers(nodes: Iterable[ShapingNode], running: Collection[str]) -> 
 
 
 def first_planned(chain: ChainPlan) -> Thread | None:
-    """The thread that begins a chain: the first executor, of no shaping node, by servers' slots."""
+    """Return the thread that begins a chain: the first executor in the order of slots.
+
+    Those of shaping nodes do not count.
+    """
     for _, planned in in_order_of_slots(chain):
         if planned.role == "executor":
             return planned
@@ -106,19 +109,22 @@ def first_planned(chain: ChainPlan) -> Thread | None:
 
 
 def in_order_of_slots(chain: ChainPlan) -> Iterator[tuple[Server, Thread]]:
-    """The planned threads that run a chain, with their servers: those of shaping nodes left out."""
+    """Yield the planned threads of a chain with their servers, without those of shaping nodes."""
     gates = {node.thread for node in shaping_nodes(chain)}
     for server in sorted(chain.servers, key=lambda server: (server.slots[0][0], server.priority)):
         yield from ((server, planned) for planned in server.threads if planned not in gates)
 
 
 def closed_before(chain: ChainPlan) -> int | None:
-    """How long (ns) before a cycle the server of a chain's first thread closes, if it does."""
+    """Return how long before a cycle (ns) the server of the chain's first thread closes.
+
+    None: that server never closes.
+    """
     slots = next(in_order_of_slots(chain))[0].slots
     is_always_open = slots[0][0] == 0 and slots[-1][1] >= chain.cycle_ns
     return None if is_always_open else chain.cycle_ns - slots[-1][1]
 
 
 def place_of(listed: NodeThread, order: Sequence[str]) -> int:
-    """Where a thread stands in an order of nodes: with the first of its own, or behind all."""
+    """Return a thread's place in an order of nodes: that of its first node, or behind all."""
     return min((order.index(node) for node in listed.nodes if node in order), default=len(order))

@@ -1,13 +1,17 @@
-"""Changing the class and cores of threads that are not ours, and putting them back.
+"""Change the scheduling class and cores of an application's threads, and put them back.
 
-Putting back looks at each aspect of a thread (:mod:`chainshaper.linux.scheduling`) by itself: one
-that is as we set it goes back to what it was; one that another program has changed since is left.
+Each aspect of a thread (:mod:`chainshaper.linux.scheduling`) is put back by itself: one that is as
+we set it becomes what it was before; one that another program has changed since is left alone.
 
-Threads inherit class and cores from those that create them. What starts while its application is
-changed gets its parent's original back, if it has what we gave to its family, and is the
-application's beyond doubt: in a process of the journal (the same id *and* start), or one that
-descends from these, or did at two looks in a row; or in a cgroup of the run. All others, such as a
-daemon whose parent ended before, are left alone: :func:`look_alikes` names them.
+A thread inherits class and cores from the thread that creates it. So threads that start while the
+application's scheduling is changed have to be put back, too: they get what their parent had before.
+That is done for a thread that has what we gave, and belongs to the application beyond doubt, by
+
+* its process, which is in the journal (same id *and* start), or descends from one there, or did at
+  two looks in a row; or
+* its cgroup, which is one of the run.
+
+All others, such as a daemon whose parent has ended, are left alone; :func:`look_alikes` names them.
 """
 
 import os
@@ -44,9 +48,9 @@ from chainshaper.linux.threads import (
 )
 from chainshaper.values.errors import OperationError, PlatformError
 
-KIND = "scheduling"
+KIND = "scheduling"  # of a journal's entries
 DESCENDANTS = "descendant"
-_GENERATIONS = 5
+_GENERATIONS = 5  # how often we look for threads that have started while others were put back
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,7 @@ class Change:
 def change_all(
     journal: Journal, changes: Iterable[tuple[RunningThread, SchedulingRequest]]
 ) -> None:
-    """Give threads, if they run still, their class and cores.
+    """Give threads that still run their class and cores.
 
     Raises OperationError: as :func:`note_scheduling` (then nothing is changed), or the kernel
     refuses. PlatformError: a privilege is missing.
@@ -125,7 +129,7 @@ def note_scheduling(
             )
         earlier = known.get(thread.identity)
         if earlier is None:
-            # What it has from a thread of ours is not what it shall have afterwards.
+            # What it has inherited from a changed thread is not what it shall have afterwards.
             family = families.get(thread.pid, ())
             inherited = [change for change in family if thread.started >= change.changed_at]
             before = _given_back(before, inherited)
@@ -148,7 +152,7 @@ def read_change(entry: Mapping[str, Any]) -> Change:
 
 
 def remembered_threads(journal: Journal) -> list[Change]:
-    """The threads of a journal, each with its changes joined, in order of their first change.
+    """Return the threads of a journal, each with its changes joined, in order of the first change.
 
     Where another program changed an aspect between two changes of ours, the aspect's original is
     what that program set.
@@ -168,17 +172,22 @@ def remembered_threads(journal: Journal) -> list[Change]:
 
 
 def note_descendants(journal: Journal, before: Collection[tuple[int, int]]) -> set[tuple[int, int]]:
-    """Write down processes that the journal's have started meanwhile.
+    """Write down processes that those of the journal have started meanwhile.
 
-    Only those are written that were there at the look ``before``, too: helpers come and go. Returns
-    all that are new, by id and start. Raises OperationError: the journal cannot be written.
+    Only those are written that an earlier look has returned, which is given as ``before``: helpers
+    come and go. Returns all that are not in the journal, by id and start. Raises OperationError:
+    the journal cannot be written.
     """
     remembered = remembered_threads(journal)
     known = {change.pid for change in remembered}
-    family = ((pid, start_of(pid, pid)) for pid in _families(journal, remembered))
-    new = {(pid, when) for pid, when in family if pid not in known and when is not None}
+    new = set[tuple[int, int]]()
+    for pid in _families(journal, remembered):
+        started = start_of(pid, pid)
+        if pid not in known and started is not None:
+            new.add((pid, started))
     new -= set(journal.read(DESCENDANTS, process_of))
-    if entries := [{"pid": pid, "started": when} for pid, when in sorted(new.intersection(before))]:
+    entries = [{"pid": pid, "started": started} for pid, started in sorted(new & set(before))]
+    if entries:
         journal.note(DESCENDANTS, *entries)
     return new
 
@@ -209,9 +218,11 @@ def release_threads(journal: Journal, groups: Iterable[Path] = ()) -> None:
         thread = find_thread(change.tid)
         if thread is not None and thread.identity == change.identity:
             give_back(thread, [change])
-    # Until its parent is restored, a new thread inherits: what starts some may have just done so.
+    # Until its parent was restored, a new thread inherited; and it may itself have started some.
     for _ in range(_GENERATIONS if remembered else 0):
-        changed = [give_back(*born) for born in _born_of(journal, remembered, groups)]
+        changed = [
+            give_back(thread, family) for thread, family in _born_of(journal, remembered, groups)
+        ]
         if not any(changed):
             break
     if refused:
@@ -226,10 +237,12 @@ def look_alikes(journal: Journal, groups: Iterable[Path] = ()) -> tuple[str, ...
     remembered = [] if journal.outdated else remembered_threads(journal)
     known = {change.identity for change in remembered}
     known |= {thread.identity for thread, _ in _born_of(journal, remembered, groups)}
+    if not remembered:
+        return ()
     lines = []
-    for thread in (thread for pid in parents() if remembered for thread in list_threads(pid)):
+    for thread in (thread for pid in parents() for thread in list_threads(pid)):
         if thread.priority == 0 or thread.identity in known:
-            continue  # cores alone are no likeness
+            continue  # any thread may have the same cores
         with suppress(ProcessLookupError):
             now = state_of(thread.tid)
             if any(
@@ -245,7 +258,10 @@ def look_alikes(journal: Journal, groups: Iterable[Path] = ()) -> tuple[str, ...
 def _born_of(
     journal: Journal, remembered: list[Change], groups: Iterable[Path]
 ) -> list[tuple[RunningThread, list[Change]]]:
-    """Threads of the application not in its journal, each with those it may have inherited from."""
+    """Find threads of the application that are not in its journal.
+
+    Returns each with the changes of the threads from which it may have inherited.
+    """
     noted = {change.identity for change in remembered}
     families = _families(journal, remembered)
     threads = [(thread, family) for pid, family in families.items() for thread in list_threads(pid)]
@@ -259,7 +275,7 @@ def _born_of(
 
 
 def _families(journal: Journal, remembered: list[Change]) -> dict[int, list[Change]]:
-    """Processes that are the application's, each with the changes that it may have inherited."""
+    """Return the processes of the application, each with the changes it may have inherited."""
     families: dict[int, list[Change]] = {}
     for change in remembered:
         families.setdefault(change.pid, []).append(change)
@@ -281,12 +297,14 @@ def _families(journal: Journal, remembered: list[Change]) -> dict[int, list[Chan
 def _given_back(state: SchedulingState, family: Iterable[Change]) -> SchedulingState:
     """Put back each aspect of a state that is as we set it for a thread of the family.
 
-    It becomes what the first such thread had before.
+    The aspect becomes what the first such thread had before.
     """
     for aspect in ASPECTS:
         for change in family:
-            ours = any(getattr(state, aspect) == getattr(given, aspect) for given in change.given)
-            if ours and aspect in different_aspects(state, change.original):
+            was_given = any(
+                getattr(state, aspect) == getattr(given, aspect) for given in change.given
+            )
+            if was_given and aspect in different_aspects(state, change.original):
                 state = with_aspect(state, aspect, change.original)
                 break
     return state

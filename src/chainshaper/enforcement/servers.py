@@ -2,9 +2,9 @@
 
 A **table** has servers with slots that repeat every cycle (paper, section 2.2.1). Between its slots
 a server's threads do not run at all (the back end ``fifo`` isolates only). Where slots of several
-servers overlap on a core, the server with the better priority runs, which is the smaller number. In
-one server the threads of the first place are the most urgent (``litmus``: they take turns). Other
-threads run when no server's thread wants to.
+servers overlap on a core, the server with the smaller priority number runs. Within a server the
+threads of the first place are the most urgent (``litmus``: threads take turns). Threads outside
+servers run when no thread of a server wants to.
 """
 
 from abc import ABC, abstractmethod
@@ -15,7 +15,7 @@ from chainshaper.values.errors import InputError
 
 @dataclass(frozen=True)
 class ReservationServer:
-    """A plan's server, for processes that have nothing but Python's standard library."""
+    """A server of a plan, for processes that have nothing but Python's standard library."""
 
     name: str
     core: int
@@ -33,7 +33,7 @@ class ServerTable:
 
 
 def server_named(table: ServerTable, name: str) -> ReservationServer:
-    """The server of a name. Raises InputError: there is none."""
+    """Return the server of a name. Raises InputError: there is none."""
     servers = {server.name: server for server in table.servers}
     if name not in servers:
         raise InputError(f"no server is named {name}: {', '.join(servers)} are")
@@ -42,7 +42,7 @@ def server_named(table: ServerTable, name: str) -> ReservationServer:
 
 @dataclass(frozen=True)
 class ServerCounters:
-    """Counts what a server has done since it was armed; None: the back end cannot know."""
+    """What a server has done since it was armed; None: the back end cannot know."""
 
     slots: int | None = None
     late_entries: int | None = None  # slots entered more than 100 us after their start
@@ -53,8 +53,9 @@ class ServerCounters:
 class BackEnd(ABC):
     """Puts a table of servers in force on this machine.
 
-    Making a back end changes nothing that an application could notice. ``assign`` and ``arm`` come
-    in any order and number; ``release`` ends it. All raise OperationError where the kernel refuses.
+    Making a back end changes nothing that an application could notice. ``assign`` and ``arm`` may
+    be called in any order, any number of times; ``release`` ends it. All raise OperationError where
+    the kernel refuses.
     """
 
     def __init__(self, table: ServerTable) -> None:
@@ -78,17 +79,17 @@ class BackEnd(ABC):
         """
 
     def in_force_from(self) -> int | None:
-        """From when on (CLOCK_MONOTONIC, ns) the latest ``arm`` is enforced; None before."""
+        """Return since when the latest ``arm`` is enforced (CLOCK_MONOTONIC, ns); None: never."""
         return self._since_ns
 
     def counters(self) -> dict[str, ServerCounters]:
-        """Counters of each server since the first ``arm``, by the server's name."""
+        """Return the counters of each server since the first ``arm``, by the server's name."""
         return {server.name: ServerCounters() for server in self._table.servers}
 
     def failure(self) -> str | None:
-        """Why the servers are no longer enforced, None while they are."""
+        """Say why the servers are no longer enforced; None: they are."""
         return None
 
     @abstractmethod
     def release(self) -> None:
-        """Everything as it was before, as far as possible; harmless when repeated."""
+        """Put everything back as it was before, as far as possible; harmless when repeated."""

@@ -2,15 +2,16 @@
 
     python -m chainshaper.enforcement.slot_dispatcher JOURNAL CORE
 
-It sleeps until a boundary, writes ``1`` to the ``cgroup.freeze`` of what closes and then ``0`` to
-that of what opens, and sleeps again. It runs on the core that it gates, above everything there: the
-timer interrupt alone takes the core from a thread whose slot has ended, so a slot is left exactly.
-The next thread runs only when the dispatcher sleeps again, so all that can wait is done at
-**ticks** between boundaries: counting, the owner's commands on the standard input, and looking for
-overruns.
+It sleeps until a boundary, freezes the cgroups of the servers that close (``cgroup.freeze``), thaws
+those of the servers that open, and sleeps again. It runs on the core that it gates, above
+everything there. So the timer interrupt takes the core from a thread exactly when its slot ends.
 
-It ends when the owner is gone, and thaws its threads however it ends; against SIGKILL and SIGSTOP
-there are guardians. Should those be gone together with the owner, it undoes the whole run.
+The next thread runs only when the dispatcher sleeps again. So all that can wait is done at
+**ticks** between boundaries: counting, obeying the owner's commands on the standard input, and
+looking for overruns.
+
+It ends when its owner has ended, and thaws its threads before. It cannot do so after SIGKILL and
+SIGSTOP, for which there are guardians. If owner and guardians are gone, it undoes the whole run.
 """
 
 import contextlib
@@ -38,55 +39,66 @@ from chainshaper.robot.clocks import sleep_until, watch_until
 from chainshaper.values.errors import ChainshaperError, OperationError, PlatformError, shown
 
 PRIORITY = 97
-_LATE_NS = 100_000
-_TICK_NS = 20_000_000
-# After a boundary: frozen threads, too, need the core to reach the freezer; and a gate may publish.
+_LATE_NS = 100_000  # a slot that is entered later than this counts as late
+_TICK_NS = 20_000_000  # between two ticks
+# No tick for so long after a boundary: threads that were frozen need the core to stop, and a gate
+# may publish.
 _REST_NS = 1_000_000
-_ROOM_NS = 200_000  # at least, between a tick and the boundaries around it
-_WATCH_NS = 100_000  # before a boundary, instead of sleeping
-_THAWED_AFTER_NS = 60_000_000  # guardians wait for a sign of life a little longer
-_FAR = 1 << 62
+_ROOM_NS = 200_000  # from a tick to the next boundary, at least
+_WATCH_NS = 100_000  # before a boundary the clock is watched for so long, where nobody is delayed
+_THAWED_AFTER_NS = 60_000_000  # guardians thaw a little later than this after a sign of life
+_FAR = 1 << 62  # an instant that never comes
 
 
 class Boundary(NamedTuple):
-    """An instant in the cycle: the servers, by place, that are open from it on, or start a slot."""
+    """An instant in the cycle at which a slot starts or ends. Servers are given by their index."""
 
-    offset_ns: int
-    open: frozenset[int]
-    starts: frozenset[int]
+    offset_ns: int  # after the start of the cycle
+    open: frozenset[int]  # servers that are open from it on
+    starts: frozenset[int]  # servers of which a slot starts there
 
 
 def boundaries_of(
     cycle_ns: int, slots: tuple[tuple[tuple[int, int], ...], ...]
 ) -> tuple[Boundary, ...]:
-    """The boundaries of one cycle, ascending; ``slots`` has one entry per server. One stands at 0
-    always: cycles of another anchor may begin there.
+    """Return the boundaries of a cycle, ascending; ``slots`` are those of each server.
+
+    There is always a boundary at 0, since cycles may begin there that have another anchor.
 
     >>> [(b.offset_ns, set(b.open)) for b in boundaries_of(10, (((0, 4),), ((4, 10),)))]
     [(0, {0}), (4, {1})]
     """
-    offsets = {0} | {edge % cycle_ns for own in slots for slot in own for edge in slot}
-    found = []
+    offsets = {0}
+    for slots_of_server in slots:
+        for start, end in slots_of_server:
+            offsets |= {start % cycle_ns, end % cycle_ns}
+    boundaries = []
     for at in sorted(offsets):
-        inside = (n for n, own in enumerate(slots) if any(a <= at < b for a, b in own))
-        begun = (n for n, own in enumerate(slots) if any(a == at for a, _ in own))
-        found.append(Boundary(at, frozenset(inside), frozenset(begun)))
-    return tuple(found)
+        is_open, starts = set[int](), set[int]()
+        for server, slots_of_server in enumerate(slots):
+            if any(start <= at < end for start, end in slots_of_server):
+                is_open.add(server)
+            if any(start == at for start, _ in slots_of_server):
+                starts.add(server)
+        boundaries.append(Boundary(at, frozenset(is_open), frozenset(starts)))
+    return tuple(boundaries)
 
 
 def instants(
     boundaries: tuple[Boundary, ...], cycle_ns: int, begin_ns: int
 ) -> Iterator[tuple[int, Boundary]]:
-    """Every boundary with its time (ns), without end, from the cycle at ``begin_ns`` on; from the
-    second on without the one at 0 where nothing changes there: no dispatcher wakes up.
+    """Yield every boundary with its instant (ns), for ever, from the cycle at ``begin_ns`` on.
+
+    From the second cycle on, the boundary at 0 is left out if nothing changes there, so that no
+    dispatcher wakes up for it.
     """
-    first, *others = boundaries
-    idle = bool(others) and first.open == others[-1].open and not first.starts
+    first, *later = boundaries
+    is_idle = bool(later) and first.open == later[-1].open and not first.starts
     yield begin_ns, first
     while True:
-        yield from ((begin_ns + boundary.offset_ns, boundary) for boundary in others)
+        yield from ((begin_ns + boundary.offset_ns, boundary) for boundary in later)
         begin_ns += cycle_ns
-        if not idle:
+        if not is_idle:
             yield begin_ns, first
 
 
@@ -96,43 +108,48 @@ def moved(
     boundaries: tuple[Boundary, ...],
     cycle_ns: int,
 ) -> Iterator[tuple[int, Boundary]]:
-    """The boundaries ``ahead`` until the new anchoring's turn comes, and its own from there on."""
+    """Yield the boundaries ``ahead`` until another anchoring begins to hold, then those of that.
+
+    Between the old cycles and the new ones all servers are closed.
+    """
     turn = min(anchoring.begin_ns, anchoring.end_ns)
     yield from takewhile(lambda item: item[0] < turn, ahead)
-    del ahead  # it may itself be a stream that was moved: only the last move matters now
+    del ahead  # it may hold the streams of earlier changes, which would pile up
     if anchoring.end_ns < anchoring.begin_ns:
         yield anchoring.end_ns, Boundary(cycle_ns, frozenset(), frozenset())
     yield from instants(boundaries, cycle_ns, anchoring.begin_ns)
 
 
 class Dispatcher:
-    """The servers of one core at work. ``groups`` are, for each of them, its cgroups by folder:
-    open files of `cgroup.freeze` and `cgroup.threads`, since a path takes longer than writing.
+    """Opens and closes the servers of a core, which are numbered here from 0.
+
+    ``groups`` are the cgroups of each server, by folder: the open files `cgroup.freeze` and
+    `cgroup.threads`. They stay open because opening them takes longer than writing.
     """
 
     def __init__(self, run: FreezerRun, core: int) -> None:
         table, page = run.table, CounterPage(run.page, run.table)
         servers = tuple(server for server in table.servers if server.core == core)
         self.cycle_ns = table.cycle_ns
-        self.boundaries = boundaries_of(table.cycle_ns, tuple(s.slots for s in servers))
-        self.places = {server.name: number for number, server in enumerate(servers)}
+        self.boundaries = boundaries_of(table.cycle_ns, tuple(server.slots for server in servers))
+        self.numbers_by_name = {server.name: number for number, server in enumerate(servers)}
         self.counters = [page.servers[server.name] for server in servers]
-        self.own = page.cores[core]
-        self.heard = b""
+        self.shared = page.cores[core]
+        self.received = b""  # the beginning of a command
         self.groups: list[dict[str, tuple[int, int]]] = [{} for _ in servers]
         self.all = frozenset(range(len(servers)))
-        self.open: frozenset[int] | None = None  # None: not armed, all are
+        self.open: frozenset[int] | None = None  # None: nothing is enforced yet, so all are
         self.upcoming = (_FAR, self.boundaries[0])
-        self.ahead: Iterator[tuple[int, Boundary]] = iter(())
-        self.rest_until = 0  # no tick before
-        self.begun: list[tuple[int, int]] = []  # servers, and how late, since the last tick
-        self.unexamined: set[int] = set()
+        self.ahead: Iterator[tuple[int, Boundary]] = iter(())  # behind the upcoming one
+        self.rest_until = 0  # no tick before this instant
+        self.begun: list[tuple[int, int]] = []  # servers opened since the last tick; how late (ns)
+        self.unexamined: set[int] = set()  # servers closed, but not yet examined for an overrun
         self.last_tick = self.last_sign = time.monotonic_ns()
-        self.let_go = self.own.let_go
+        self.let_go = self.shared.let_go
         self.owner, _ = run.owner
 
     def run(self) -> None:
-        """Until the owner or a signal ends it. Raises OperationError: the owner is gone."""
+        """Open and close servers until a signal comes. Raises OperationError: the owner is gone."""
         while True:
             self._tick_until_boundary()
             at, boundary = self.upcoming
@@ -140,15 +157,17 @@ class Dispatcher:
             before = self.all if self.open is None else self.open
             begun = dict.fromkeys(boundary.starts, at)
             if boundary.open and not before:
-                # Waking an idle core takes longest, and delays no thread of ours now.
+                # An idle core takes longest to wake up, and no server is open to be delayed.
                 sleep_until(at - _WATCH_NS)
                 watch_until(at)
             else:
                 sleep_until(at)
             while following[0] <= time.monotonic_ns():
-                # A stall took more than a boundary: what should be open by now counts.
+                # The machine stalled past more than a boundary: only the last one counts.
                 (at, boundary), following = following, next(self.ahead)
-                begun = {one: since for one, since in begun.items() if one in boundary.open}
+                begun = {
+                    server: since for server, since in begun.items() if server in boundary.open
+                }
                 begun.update(dict.fromkeys(boundary.starts, at))
             closing = before - boundary.open
             self._write(closing, b"1")
@@ -161,10 +180,12 @@ class Dispatcher:
             self._give_sign(switched)
 
     def thaw_all(self) -> None:
+        """Open all servers, and enforce nothing any more."""
         self._write(self.all, b"0")
         self.open = None
 
     def _write(self, servers: Iterable[int], value: bytes) -> None:
+        """Freeze (``1``) or thaw (``0``) all cgroups of these servers."""
         for server in sorted(servers):
             for folder, files in list(self.groups[server].items()):
                 try:
@@ -172,12 +193,12 @@ class Dispatcher:
                 except OSError as error:
                     if error.errno != errno.ENODEV:
                         raise
-                    self._forget(server, folder)  # its threads have ended: the others go on
+                    self._forget(server, folder)  # it was removed, since its threads have ended
 
     def _tick_until_boundary(self) -> None:
-        """Tick until the boundary is near. Where there is never room, after ten at the latest."""
+        """Tick until the boundary is near."""
         tick_at = time.monotonic_ns()
-        if tick_at - self.last_tick > 10 * _TICK_NS:
+        if tick_at - self.last_tick > 10 * _TICK_NS:  # boundaries leave no room for ticks
             self._tick()
         tick_at = max(tick_at, self.rest_until)
         while tick_at + _ROOM_NS <= self.upcoming[0]:
@@ -186,7 +207,7 @@ class Dispatcher:
             tick_at = self.last_tick + _TICK_NS
 
     def _tick(self) -> None:
-        """A sign of life, and all that has waited."""
+        """Do all that has waited: count, look for overruns, obey commands; give a sign of life."""
         self.last_tick = time.monotonic_ns()
         for server, late_ns in self.begun:
             counters = self.counters[server]
@@ -201,11 +222,12 @@ class Dispatcher:
         self._obey()
 
     def _give_sign(self, now: int) -> None:
-        """Show that we live, and close again what a guardian, or the other later, has thawed."""
-        self.own.beats += 1
-        let_go = self.own.let_go
-        thawed = let_go != self.let_go or now - self.last_sign > _THAWED_AFTER_NS
-        if self.open is not None and thawed:
+        """Show guardians that we live, and close again what one of them may have thawed."""
+        self.shared.beats += 1
+        let_go = self.shared.let_go
+        # A guardian notes it after thawing, so the time since our last sign counts as well.
+        may_be_thawed = let_go != self.let_go or now - self.last_sign > _THAWED_AFTER_NS
+        if self.open is not None and may_be_thawed:
             self._write(self.all - self.open, b"1")
         self.last_sign, self.let_go = now, let_go
 
@@ -221,34 +243,41 @@ class Dispatcher:
                     counters.overruns = -1
             if ran is not None:
                 self.unexamined.discard(server)
-                counters.overruns += ran and counters.overruns >= 0
+                if ran and counters.overruns >= 0:
+                    counters.overruns += 1
 
     def _obey(self) -> None:
+        """Obey the commands that the owner has sent. Raises OperationError: it is gone."""
         with contextlib.suppress(BlockingIOError):
             while received := os.read(sys.stdin.fileno(), 65536):
-                self.heard += received
+                self.received += received
             raise OperationError("the owner is gone")
-        *lines, self.heard = self.heard.split(b"\n")
+        *lines, self.received = self.received.split(b"\n")
         for line in lines:
             command = json.loads(line)
             if "folder" in command:
-                self._add(self.places[command["server"]], command["folder"])
+                self._add(self.numbers_by_name[command["server"]], command["folder"])
             else:
                 anchoring = Anchoring(command["begin_ns"], command["end_ns"])
-                slots = tuple(tuple((a, b) for a, b in own) for own in command["slots"])
+                slots = tuple(
+                    tuple((start, end) for start, end in slots_of_server)
+                    for slots_of_server in command["slots"]
+                )
                 self.boundaries = boundaries_of(self.cycle_ns, slots)
                 ahead = chain([self.upcoming], self.ahead)
                 self.ahead = moved(ahead, anchoring, self.boundaries, self.cycle_ns)
                 self.upcoming = next(self.ahead)
-            self.own.acknowledged = command["number"]
+            self.shared.acknowledged = command["number"]
 
     def _forget(self, server: int, folder: str) -> None:
+        """Close the files of a cgroup."""
         for file in self.groups[server].pop(folder, ()):
             os.close(file)
 
     def _add(self, server: int, folder: str) -> None:
-        self._forget(server, folder)  # of a container of that name that ended
-        with contextlib.suppress(FileNotFoundError):  # another process was quick to remove it
+        """Add a cgroup to a server, closed if the server is."""
+        self._forget(server, folder)  # an earlier group of the same path, which was removed
+        with contextlib.suppress(FileNotFoundError):  # it was removed meanwhile
             self.groups[server][folder] = (
                 os.open(f"{folder}/cgroup.freeze", os.O_WRONLY | os.O_CLOEXEC),
                 os.open(f"{folder}/cgroup.threads", os.O_RDONLY | os.O_CLOEXEC),
@@ -258,10 +287,13 @@ class Dispatcher:
 
 
 def overrun(groups: Iterable[int]) -> bool | None:
-    """Whether a frozen thread was computing when it was stopped, at the end of its slot: in user
-    mode, which is -1 in ``/proc/TID/syscall``; one inside a system call passes for one that waits.
-    None: one has not reached the freezer yet, for want of the core. ``groups`` are open
-    ``cgroup.threads`` files. Raises PermissionError: not to be seen by us.
+    """Return whether a frozen thread was computing when its slot ended.
+
+    It was if it stopped in user mode, for which ``/proc/TID/syscall`` has -1; a thread inside a
+    system call is taken for one that waits. None: a thread has not stopped yet, since it did not
+    get the core. ``groups`` are open ``cgroup.threads`` files.
+
+    Raises PermissionError: we may not see it.
     """
     undecided = False
     for group in groups:
@@ -280,7 +312,10 @@ def overrun(groups: Iterable[int]) -> bool | None:
 
 
 def _become_real_time(core: int) -> None:
-    """Highest class, if it is permitted, then the core. Raises PlatformError: no such core."""
+    """Take the highest class, if it is permitted, then the core.
+
+    Raises PlatformError: there is no such core.
+    """
     become_fifo(PRIORITY)  # first: where a SCHED_FIFO thread spins, SCHED_OTHER would not run again
     try:
         os.sched_setaffinity(0, {core})
@@ -313,7 +348,7 @@ def main() -> None:
         with contextlib.suppress(OSError):  # the owner may be gone, who would read it
             sys.stderr.write(shown(str(error)) + "\n")
         if isinstance(error, OperationError):
-            # Guardians have learnt of it earlier. If there is none left, it is for us.
+            # Guardians have undone the run by now. If none is left, it is up to this process.
             from chainshaper.enforcement.undoing import undo_run
 
             undo_run(journal)

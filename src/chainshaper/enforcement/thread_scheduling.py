@@ -8,18 +8,22 @@ SCHED_FIFO priorities (DESIGN section 6). From the most urgent:
   have the first of these cores;
 * servers, below 88, in the order of their own priority; threads of one server in the order in which
   the plan names their nodes: at one priority, callbacks that become ready at once would run in the
-  order in which DDS happens to deliver. Where priorities are too few, the last of a server share
-  one; where slots are made of what single callbacks took, all but the first do, as while that was
-  measured (:attr:`~chainshaper.planning.plan.Plan.most_urgent_first`). Turns
-  (SCHED_RR), only if the plan wants them, end within a callback, which then waits for another;
-* nodes that receive what a shaping node publishes: where the plan has a place for them, there,
-  behind the shaping nodes and above all others; else below all servers, on the shaping node's core,
-  or, of several chains, whose servers keep that core busy, on the first core without servers;
+  order in which DDS happens to deliver. Where priorities are too few, the last threads of a server
+  share one. Where slots are as long as single callbacks took, all but the first share one, as they
+  did when that was measured (:attr:`~chainshaper.planning.plan.Plan.most_urgent_first`). Threads
+  take turns (SCHED_RR) only if the plan wants that: a turn ends within a callback, which then waits
+  for another thread;
+* nodes that receive what a shaping node publishes. Where the plan has a place for them, that is
+  behind the shaping nodes and above everything else there. Otherwise they are below all servers, on
+  the shaping node's core or, in a plan of several chains, whose servers keep that core busy, on the
+  first core without servers;
 * an asynchronous publisher, below every other thread of its process on its core: it spins on the
   writer's lock, and above them would never let them release it;
 * the thread by which Fast DDS sends what synchronous writers could not (`dds.asyn.N.0`), under the
-  fair class, on the cores of DDS threads, since it spins on the same locks
-  (`FlowControllerImpl::run`), and the threads of best-effort servers. All others are left alone.
+  fair class on the cores of DDS threads, since it spins on the same locks
+  (`FlowControllerImpl::run`); and the threads of best-effort servers.
+
+All other threads are left alone.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -54,10 +58,11 @@ class WantedScheduling:
 
 
 def server_priorities(sizes: Mapping[int, int]) -> dict[int, tuple[int, ...]]:
-    """The real-time priorities of each server priority: 87, 86, …, the most urgent first.
+    """Return the real-time priorities of each server priority: 87, 86, …, the most urgent first.
 
-    ``sizes`` is how many nodes the largest server of each priority has. It gets as many real-time
-    priorities; fewer, where those of all do not fit. Raises InputError: too many server priorities.
+    ``sizes`` says how many places the largest server of each priority has. A server priority gets
+    as many real-time priorities, or fewer where not all would fit. Raises InputError: there are too
+    many server priorities.
     """
     room = _BEST_SERVER_PRIORITY - 1 - _BELOW * len(sizes)
     if room < len(sizes):
@@ -78,9 +83,9 @@ def server_priorities(sizes: Mapping[int, int]) -> dict[int, tuple[int, ...]]:
 def plan_scheduling(
     plan: Plan, allocation: Allocation, available_cores: Sequence[int]
 ) -> tuple[WantedScheduling, ...]:
-    """What every thread concerned by a plan gets: servers' threads first, then the others.
+    """Return what every thread gets that a plan concerns: servers' threads first, then the others.
 
-    Raises: as :func:`.server_members` and :func:`scheduling_around`.
+    Raises OperationError, InputError: as :func:`.server_members` and :func:`scheduling_around`.
     """
     members = server_members(plan, allocation)
     cores = {receiver: node.core for node in plan.shaping_nodes for receiver in node.receivers}
@@ -102,7 +107,7 @@ def plan_scheduling(
 
 
 def waiting_receivers(plan: Plan, wanted: Iterable[WantedScheduling]) -> list[str]:
-    """Notes on nodes that receive an output on a core that other chains' servers keep busy."""
+    """Return notes on nodes that receive an output on a core that is busy with other chains."""
     if len(plan.chains) == 1:
         return []
     busy = {(server.core,) for server in plan.servers}
@@ -132,20 +137,20 @@ def scheduling_around(
     take_turns: bool = False,
     clear: Collection[int] = (),
 ) -> tuple[WantedScheduling, ...]:
-    """What the threads of servers, and the other threads of their processes, get.
+    """Return what the threads of servers, and the other threads of their processes, get.
 
-    ``members`` are the threads of each server, by its name. Within a server the threads are urgent
-    in the ``order`` of their nodes, the most urgent first; threads of other nodes come behind
-    these, and share a priority. Threads of servers that are ``behind``, by name, come behind the
-    first of each server of their priority.
-
-    ``receivers`` are nodes that receive an output, and the core for their executors. An executor
-    that is real-time already, on cores of no server, stays as it is: its other callbacks were
-    placed there. Some receivers have ``places`` in the plan, with another priority, and core, if it
-    is available.
-
-    With ``take_turns``, servers of one priority share it by turns. DDS threads leave the cores of
-    all servers or, where there are no other cores, those to be ``clear``.
+    * ``members``: the threads of each server, by its name.
+    * ``order``: nodes, the most urgent first. So are a server's threads ordered; threads of other
+      nodes come behind these, and share a priority.
+    * ``behind``: the names of servers whose threads come behind the first thread of each server of
+      their priority.
+    * ``receivers``: nodes that receive an output, and the core for their executors. An executor
+      that is real-time already, on cores of no server, stays as it is: it was placed there for its
+      other callbacks.
+    * ``places``: for some receivers, another priority and, if it is available, another core.
+    * ``take_turns``: whether servers of one priority share it by turns (SCHED_RR).
+    * ``clear``: the cores that DDS threads leave where all cores have servers; otherwise they leave
+      all cores with servers.
 
     Raises OperationError: a thread cannot leave the core of a publisher that would outrank it.
     InputError: see :func:`server_priorities`.
@@ -212,14 +217,14 @@ def _sizes(
     behind: Collection[str],
     places: Mapping[str, ReceiverPlace],
 ) -> dict[int, int]:
-    """How many real-time priorities each server priority needs, receivers' places included."""
+    """Return how many real-time priorities each server priority needs, receivers included."""
     sizes: dict[int, int] = {}
     for server in servers:
         if not _is_best_effort(server):
             size = len(places_taken[server.name]) + (1 if server.name in behind else 0)
             sizes[server.priority] = max(1, sizes.get(server.priority, 0), size)
     for rank in {place.priority for place in places.values()} & sizes.keys():
-        sizes[rank] += 1  # behind all of it
+        sizes[rank] += 1  # for the receivers, behind the servers
     return sizes
 
 
@@ -230,7 +235,7 @@ def _scheduling_in(
     *,
     take_turns: bool,
 ) -> SchedulingRequest:
-    """What a thread gets in a server, whose threads share these priorities in order of place."""
+    """Return what a thread gets that has this place in a server of these real-time priorities."""
     if _is_best_effort(server):
         return SchedulingRequest(0, (server.core,))
     priority = priorities[min(place, len(priorities) - 1)]
@@ -246,7 +251,7 @@ def _receiving(
     available_cores: Collection[int],
     busy: Collection[int],
 ) -> tuple[list[WantedScheduling], set[int]]:
-    """What executors of nodes that receive an output get, and the ids of their processes.
+    """Return what executors of nodes that receive an output get, and their processes' ids.
 
     See :func:`scheduling_around`; ``busy`` are the cores of servers.
     """
@@ -270,7 +275,7 @@ def _receiving(
 
 
 def _routers_of(pids: Collection[int], allocation: Allocation) -> set[int]:
-    """The processes of Zenoh's router, if one of these processes uses Zenoh."""
+    """Return the processes of Zenoh's router, if one of these processes uses Zenoh."""
     threads = allocation.threads
     if not any(listed.thread.pid in pids and is_of_zenoh(listed.thread) for listed in threads):
         return set()
@@ -284,10 +289,10 @@ def _beside(
     *,
     receives_output: bool,
 ) -> WantedScheduling | None:
-    """Scheduling of a thread outside servers whose process has a thread in one; None: as it is.
+    """Return what a thread outside servers gets whose process has threads in one.
 
-    DDS threads stay where they are if no core is left to them; others, of no class of their own,
-    leave the core of a publisher, which would outrank them.
+    None: it stays as it is. DDS threads stay on their cores if no others are left to them. Other
+    threads leave the core of an asynchronous publisher, which would outrank them.
     """
     thread = listed.thread
     if thread.kind == "resend":
@@ -345,11 +350,12 @@ def _below_siblings(
 def left_by_back_end(
     back_end: str, wanted: Iterable[WantedScheduling], free: Collection[Thread] = ()
 ) -> tuple[WantedScheduling, ...]:
-    """What threads get from us where a back end schedules its servers' threads itself.
+    """Leave out what a back end does itself that schedules its servers' threads in the kernel.
 
-    Then they get no priority from us, and under sched_ext none may be left, since the kernel runs
-    real-time threads above it. ``free`` threads, which no back end keeps in their slots, do stand
-    above, and so do receivers that have a place there; others are left as they are.
+    * Servers' threads get no priority from us. Under sched_ext they may not even have one, since
+      the kernel runs real-time threads above its policy.
+    * ``free`` threads, which no back end keeps in their slots, keep their priority, above servers.
+    * Receivers of an output keep theirs if they have a place in the plan; others are left alone.
     """
     if back_end not in ("scx", "litmus"):
         return tuple(wanted)

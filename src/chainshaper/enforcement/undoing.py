@@ -1,9 +1,11 @@
-"""Runs from their claim to their end: which cores and nodes, what they say, and undoing them.
+"""A run from its claim to its end: the cores and nodes it claims, its state, and undoing it.
 
-Two plans never govern the same core or node: each run claims its own in its journal, under a lock
-of the folder of all runs. A run that is in force is asked to end; one whose owner is gone, or does
-not react, is undone from its journal, by whichever process is left. Where the journal itself is
-gone, cgroups of ours are found by their names.
+Two plans never govern the same core or node. So each run writes into its journal which cores and
+nodes it claims, while it has the folder of all runs locked.
+
+A run that is in force is asked to end. If its owner has ended, or does not react, any other process
+can undo the run from its journal. Where even the journal is gone, the run's cgroups are known by
+their names (:func:`release_strays`).
 """
 
 import contextlib
@@ -52,29 +54,29 @@ from chainshaper.values.files import open_output, read_regular
 
 CLAIMS = "claims"
 PATIENCE_S = 20.0
-"""A run has so long to begin, or to end when asked (its command not counted); who undoes one has
-half of that."""
+"""How long a run may take to begin, or to end when asked, its command's end not counted.
+
+A process that undoes a run has half of that.
+"""
 
 
 @dataclass(frozen=True)
 class ServerState(ReservationServer):
-    """A server in force; a back end, or a node's ``gate``, restricts its threads (``kept_by``)."""
+    """A server in force."""
 
-    threads: tuple[int, ...]
-    kept_by: str
+    threads: tuple[int, ...]  # their ids
+    kept_by: str  # what restricts them to the slots: a back end's name or, in a node, "gate"
     counters: ServerCounters
 
 
 @dataclass(frozen=True)
 class SlotMove:
-    """From an instant on a chain's slots are ``moved_ns`` behind the plan's, its output's last one
-    ``start_ns`` after its origin.
-    """
+    """A shift of a chain's slots against those of the plan."""
 
-    from_ns: int
+    from_ns: int  # the instant from which it holds (CLOCK_MONOTONIC)
     chain: str
-    moved_ns: int
-    start_ns: int
+    moved_ns: int  # how much later than planned the slots begin
+    start_ns: int  # when the last slot of the chain's output begins now, after the chain's origin
     why: str
 
     @property
@@ -85,32 +87,35 @@ class SlotMove:
 
 @dataclass(frozen=True)
 class RunState:
-    """A plan in force. Instants are ns of CLOCK_MONOTONIC, None if they are still to come. Cycles
-    start at ``anchor_ns`` + k * ``cycle_ns``, the first enforced as a whole ``in_force_ns``; the
-    chain's beginning has moved by ``drift_ns`` since; ``failure``: why it is not enforced.
+    """The state of a run, as `run.json` shows it.
+
+    Instants are of CLOCK_MONOTONIC (ns), and None as long as they are still to come.
     """
 
-    run: str
-    owner: int
-    plan: str
-    command: tuple[str, ...]
+    run: str  # its name
+    owner: int  # the id of the process that keeps the plan in force
+    plan: str  # the path of its file
+    command: tuple[str, ...]  # that the run has started; (): none
     back_end: str
-    reason: str
+    reason: str  # why this back end was chosen
     started_ns: int
     cycle_ns: int
-    anchor_ns: int | None = None
-    phase_spread_ns: int | None = None
-    drift_ns: int | None = None
+    anchor_ns: int | None = None  # cycles start at this instant + k * cycle_ns
+    phase_spread_ns: int | None = None  # of the chain's beginnings, when the anchor was measured
+    drift_ns: int | None = None  # how far the chain's beginning has moved since
     servers: tuple[ServerState, ...] = ()
     notes: tuple[str, ...] = ()
-    failure: str | None = None
-    in_force_ns: int | None = None
+    failure: str | None = None  # why the plan is not enforced; None: it is
+    in_force_ns: int | None = None  # when the first whole cycle that was enforced began
     ended_ns: int | None = None
-    moves: tuple[SlotMove, ...] = ()  # the latest, of as many as a chain's gate has had
+    moves: tuple[SlotMove, ...] = ()  # the latest ones of each chain's gate
 
 
 def save_run_state(folder: Path, state: RunState) -> None:
-    """Write `run.json`, whole. Raises OSError; a plan in force needs it for nothing."""
+    """Write `run.json` whole, so that nobody reads a part of it.
+
+    Raises OSError: it cannot be written. That may be ignored: a plan in force does not read it.
+    """
     partial_file = folder / f"{STATE_FILE}.partial"
     try:
         partial_file.unlink(missing_ok=True)
@@ -118,12 +123,12 @@ def save_run_state(folder: Path, state: RunState) -> None:
             file.write(json.dumps(storable(asdict(state))))
         partial_file.replace(folder / STATE_FILE)
     finally:
-        partial_file.unlink(missing_ok=True)  # a part of it would fill the disk for good
+        partial_file.unlink(missing_ok=True)  # what a full disk did not take would stay on it
 
 
 def find_runs(folder: Path | None = None) -> Iterator[tuple[Journal, RunState | None]]:
-    """All runs that are not over, crashed ones included, with what they last said of themselves."""
-    from pydantic import TypeAdapter  # guardians have Python alone
+    """Yield all runs that are not over, crashed ones included, each with its last state."""
+    from pydantic import TypeAdapter  # here: guardians import this module, and need no pydantic
 
     for journal in find_journals(folder):
         state = None
@@ -135,7 +140,7 @@ def find_runs(folder: Path | None = None) -> Iterator[tuple[Journal, RunState | 
 
 
 def runs_as_json(folder: Path | None = None) -> list[dict[str, Any]]:
-    """The same as plain data; ``unreadable`` are :func:`strange_lines`."""
+    """Return all runs that are not over as plain data; ``unreadable`` are its strange lines."""
     return [
         {
             "run": journal.name,
@@ -154,10 +159,12 @@ def claim_run(
     folder: Path | None = None,
     go_on: Callable[[], None] = lambda: None,
 ) -> Journal:
-    """Begin a run that governs these cores and nodes: the journal for all that it changes. While
-    another begins, ``go_on`` is called, and may raise. Raises OperationError: a living run governs
-    one of them, a crashed one cannot be undone, or one that begins does not get on with it.
-    PlatformError: nothing may be written to the folder.
+    """Begin a run that governs these cores and nodes; return the journal for its changes.
+
+    ``go_on`` is called while another run begins, and may raise an exception to stop waiting.
+
+    Raises OperationError: a living run governs one of the cores or nodes, a crashed one cannot be
+    undone, or one that begins takes too long. PlatformError: nothing may be written to the folder.
     """
     base = journals_folder(folder)
     wanted: dict[str, set[Any]] = {"core": set(cores), "node": set(nodes)}
@@ -165,46 +172,63 @@ def claim_run(
     def waiting(holder: LockHolder | None, waited_s: float) -> None:
         go_on()
         if waited_s > PATIENCE_S:
-            late = f"begins a run, and has not got on with it for {PATIENCE_S:g} s"
-            if holder is None:
-                raise OperationError(f"a process that is not to be seen from here {late}: end it")
-            pid = holder.pid
-            raise OperationError(
-                f"process {pid} {late}: let it go on (`kill -CONT {pid}`), or end it "
-                f"(`kill -KILL {pid}`)"
-            )
+            raise OperationError(_late_beginning(holder))
 
     with contextlib.ExitStack() as stack:
         try:
-            base.mkdir(mode=0o755, parents=True, exist_ok=True)  # ours alone: it is believed
+            # No other user may write there: what journals say is believed, and undone.
+            base.mkdir(mode=0o755, parents=True, exist_ok=True)
             stack.enter_context(all_runs_locked(base, waiting))
         except OSError as error:
             raise PlatformError(
                 f"{base}, where runs keep a journal of what they change, cannot be used "
                 f"({error.strerror}): run as root, or set $XDG_RUNTIME_DIR to a folder of yours"
             ) from error
-        for other in find_journals(base):
-            shared = " and ".join(
-                f"{kind} {', '.join(map(str, sorted(claimed & wanted[kind])))}"
-                for claim in other.read(CLAIMS, _read_claim)
-                for kind, claimed in claim.items()
-                if claimed & wanted[kind]
-            )
-            if (owner := other.owner) is not None and shared:
-                raise OperationError(
-                    f"the run {other.name} of process {owner} governs {shared} already: end it "
-                    f"first (`chainshaper release {other.name}`)"
-                )
-            is_in_the_way = owner is None and (shared or not other.entries(CLAIMS))
-            if is_in_the_way and (left := undo_run(other)):
-                why = "; ".join(left)
-                raise OperationError(f"the crashed run {other.name} cannot be undone: {why}")
+        for earlier in find_journals(base):
+            _make_way(earlier, wanted)
         journal = open_journal(base)
         journal.note(CLAIMS, cores=sorted(cores), nodes=sorted(nodes))
         return journal
 
 
+def _late_beginning(holder: LockHolder | None) -> str:
+    """Say that a process has had the folder of all runs locked for too long, and the remedy."""
+    late = f"begins a run, and has not got on with it for {PATIENCE_S:g} s"
+    if holder is None:
+        return f"a process that is not to be seen from here {late}: end it"
+    pid = holder.pid
+    return (
+        f"process {pid} {late}: let it go on (`kill -CONT {pid}`), or end it (`kill -KILL {pid}`)"
+    )
+
+
+def _make_way(earlier: Journal, wanted: Mapping[str, set[Any]]) -> None:
+    """Undo an earlier run that has crashed, if it governs one of the cores or nodes ``wanted``.
+
+    Raises OperationError: it cannot be undone, or it has not crashed.
+    """
+    shared = " and ".join(
+        f"{kind} {', '.join(map(str, sorted(claimed & wanted[kind])))}"
+        for claim in earlier.read(CLAIMS, _read_claim)
+        for kind, claimed in claim.items()
+        if claimed & wanted[kind]
+    )
+    owner = earlier.owner
+    if owner is not None:
+        if shared:
+            raise OperationError(
+                f"the run {earlier.name} of process {owner} governs {shared} already: end it "
+                f"first (`chainshaper release {earlier.name}`)"
+            )
+        return
+    may_have_claimed = shared or not earlier.entries(CLAIMS)
+    if may_have_claimed and (left := undo_run(earlier)):
+        why = "; ".join(left)
+        raise OperationError(f"the crashed run {earlier.name} cannot be undone: {why}")
+
+
 def _read_claim(entry: Mapping[str, Any]) -> dict[str, set[Any]]:
+    """Return the claimed cores and nodes of a journal's entry, by their kind."""
     return {"core": set(map(int, entry["cores"])), "node": set(map(str, entry["nodes"]))}
 
 
@@ -217,11 +241,11 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any]], object]] = {
     freezer.FREEZER: freezer.read_run,
     litmus.NOTE: litmus.read_note,
 }
-"""All that a journal may speak of, and how it is read."""
+"""The kinds of entries that a journal may have, and what reads each."""
 
 
 def strange_lines(journal: Journal) -> tuple[str, ...]:
-    """Lines of a journal that say nothing, in sentences: what they spoke of is not undone."""
+    """Return a sentence for each line of a journal that cannot be read, so nor undone."""
     return tuple(
         f"{journal.path}, line {number} is not a line of a journal, so what it may have said is "
         f"not undone: {line[:200]!r}"
@@ -230,8 +254,10 @@ def strange_lines(journal: Journal) -> tuple[str, ...]:
 
 
 def end_run(journal: Journal) -> tuple[str, ...]:
-    """End a run: its owner does it, made to go on if it was stopped (Ctrl-Z), or we do, if it is
-    gone or has to be killed. What could not be undone. Raises OperationError: it is not ours.
+    """End a run; return what could not be undone, in sentences.
+
+    Its owner is asked to end it, and made to go on if it was stopped (Ctrl-Z). If the owner has
+    ended, or has to be killed, the run is undone here. Raises OperationError: it is another user's.
     """
     if (pidfd := journal.open_owner()) is not None:
         try:
@@ -255,7 +281,8 @@ def end_run(journal: Journal) -> tuple[str, ...]:
 
 
 def _wait_for_end(journal: Journal) -> bool:
-    # Its command, which it ends on its way, has so long as well, and would run on without it.
+    """Wait until a run has ended; return whether it has in time."""
+    # The owner first ends the run's command, which would run on if the owner were killed.
     deadline = time.monotonic() + PATIENCE_S + 4 * own_processes.PATIENCE_S
     while journal.path.exists() and journal.owner is not None:
         if time.monotonic() > deadline:
@@ -265,8 +292,10 @@ def _wait_for_end(journal: Journal) -> bool:
 
 
 def undo_run(journal: Journal, *, by_owner: bool = False) -> tuple[str, ...]:
-    """Undo what a run has changed; what could not be undone, in sentences. If its owner is gone or
-    asks for it, the run is removed, unless something is left, or its journal has strange lines.
+    """Undo what a run has changed; return what could not be undone, in sentences.
+
+    If its owner has ended, or calls this, the run is removed as well, unless something could not be
+    undone, or its journal has strange lines.
     """
     left: list[str] = []
     with contextlib.ExitStack() as stack:
@@ -275,13 +304,13 @@ def undo_run(journal: Journal, *, by_owner: bool = False) -> tuple[str, ...]:
                 return ()
             stack.enter_context(locked(journal.path.parent, _hasten))
         except FileNotFoundError:
-            return ()  # another process was quicker
+            return ()  # another process has undone it meanwhile
         except OperationError as error:
             return (str(error),)
         except OSError:
-            pass  # its folder is gone, and there is no room for another: it is in memory
+            pass  # its folder is gone, and cannot be made anew: the journal in memory is enough
         _end_processes(journal, DISPATCHER)
-        # Threads run first; those born in our groups are known by them, as long as these are.
+        # Threads run first. The groups go last: threads that were born in them are known by them.
         groups = freezer.groups_of(freezer.run_of(journal))
         freezer.thaw(groups)
         for undo in (
@@ -302,7 +331,7 @@ def undo_run(journal: Journal, *, by_owner: bool = False) -> tuple[str, ...]:
 
 
 def _hasten(holder: LockHolder | None, waited_s: float) -> None:
-    """Another process undoes this run: one that was stopped goes on, one that hangs is ended."""
+    """Make the process that undoes a run go on, if it was stopped, or end it, if it hangs."""
     if holder is None or holder.pid == os.getpid():
         return
     if (pidfd := open_process(holder.pid, holder.started)) is not None:
@@ -314,7 +343,10 @@ def _hasten(holder: LockHolder | None, waited_s: float) -> None:
 
 
 def _end_processes(journal: Journal, role: str) -> None:
-    """Kill all processes of a role, this one excepted: one that was stopped hears nothing else."""
+    """Kill all processes of a role, this one excepted.
+
+    SIGKILL, since a process that was stopped does not react to other signals.
+    """
     for process in processes_of_role(journal, role):
         if process.pid == os.getpid():
             continue
@@ -325,6 +357,7 @@ def _end_processes(journal: Journal, role: str) -> None:
 
 
 def _restore_groups(journal: Journal) -> None:
+    """Dissolve the cgroups of a run. Raises OperationError: some are left."""
     left = freezer.restore(freezer.run_of(journal))
     if journal.owner is None and strange_lines(journal):  # one of them may have spoken of groups
         left += tuple(filter(None, map(cgroups.dissolve, freezer.stray_groups(()))))
@@ -333,7 +366,7 @@ def _restore_groups(journal: Journal) -> None:
 
 
 def remove_run(journal: Journal) -> None:
-    """Remove the folder of a run that is over: what it shows of itself, then the journal."""
+    """Remove the folder of a run that is over, its journal last."""
     with contextlib.suppress(FileNotFoundError):
         for path in journal.path.parent.iterdir():
             if path != journal.path and not path.is_dir():
@@ -342,8 +375,10 @@ def remove_run(journal: Journal) -> None:
 
 
 def release_strays(journals: Iterable[Journal]) -> tuple[tuple[Path, ...], tuple[str, ...]]:
-    """Dissolve :func:`.stray_groups`: their threads run again, and it is mounted as before. Returns
-    the groups that are gone, and what could not be put back, since nothing says what was there.
+    """Dissolve cgroups that no journal names (:func:`.stray_groups`), so that their threads run.
+
+    Returns the groups that are gone, and sentences that name what could not be put back: without a
+    journal it is not known what was there before.
     """
     gone, left = [], []
     for folder in freezer.stray_groups(journals):
@@ -352,8 +387,9 @@ def release_strays(journals: Iterable[Journal]) -> tuple[tuple[Path, ...], tuple
             gone.append(folder)
         else:
             left.append(why)
-        real_time = (one for one in map(find_thread, tids) if one is not None and one.priority)
-        for thread in real_time:
+        for thread in map(find_thread, tids):
+            if thread is None or not thread.priority:
+                continue
             with contextlib.suppress(ProcessLookupError):
                 left.append(
                     f"{thread.text} runs on under {state_of(thread.tid).text}, and what it had"

@@ -27,7 +27,13 @@ from chainshaper.enforcement.scheduling_memory import look_alikes
 from chainshaper.enforcement.servers import BackEnd
 from chainshaper.enforcement.thread_scheduling import waiting_receivers
 from chainshaper.enforcement.undoing import RunState
-from chainshaper.flow import threads
+from chainshaper.flow.followed_chains import followed_chains
+from chainshaper.flow.plan_checks import (
+    check_publishers,
+    refuse_other_clocks,
+    refuse_simulated,
+    refuse_unfit,
+)
 from chainshaper.flow.plan_in_force.anchor import AnchoredPlan
 from chainshaper.flow.plan_in_force.followers import Followers
 from chainshaper.flow.plan_in_force.origins import OriginWatches
@@ -41,12 +47,15 @@ from chainshaper.flow.plan_in_force.threads import (
     note_absent,
     note_strangers,
 )
+from chainshaper.flow.recorded_processes import evidence_of, recorded_in
+from chainshaper.flow.server_tables import server_table
 from chainshaper.linux.own_processes import end_command, start_command
 from chainshaper.linux.processes import run_users
 from chainshaper.linux.scheduling import check_cores
 from chainshaper.planning.offsets import LEAD_NS, chain_name
 from chainshaper.planning.overruns import publication_warnings
 from chainshaper.planning.plan import Plan
+from chainshaper.splicing.shaped_outputs import remove_abandoned_pages
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import OperationError
 from chainshaper.values.progress import Progress
@@ -101,16 +110,16 @@ def apply_plan(
     the servers failed, the application ended, or ``stop`` was set before the plan was in force.
     """
     user_ids = run_users(users)
-    threads.server_table(plan)
+    server_table(plan)
     check_cores({server.core: f"server {server.name}" for server in plan.servers})
     choice = choose_back_end(back_end)
-    threads.refuse_unfit(plan, choice.name)
+    refuse_unfit(plan, choice.name)
     reaches_ns, why_not = dict[int, tuple[int, int]](), list[str]()
     if adapt:
-        plan, reaches_ns, why_not = threads.followed_chains(plan, choice.name, max_latency_ns)
+        plan, reaches_ns, why_not = followed_chains(plan, choice.name, max_latency_ns)
     # Looked up once: that takes longer than looking at processes.
-    recordings, unread = threads.evidence_of(plan, recording)
-    recorded, unread = threads.recorded_in(recordings, unread)
+    recordings, unread = evidence_of(plan, recording)
+    recorded, unread = recorded_in(recordings, unread)
     stop = stop or threading.Event()
 
     def go_on() -> None:
@@ -119,7 +128,7 @@ def apply_plan(
 
     journal = _claim(plan, folder, go_on)
     run = _Run(journal)
-    found = RunThreads(journal, recorded, user_ids, unread)
+    run_threads = RunThreads(journal, recorded, user_ids, unread)
     anchored = AnchoredPlan(plan, plan, choice.name)
     if wait_ns is None:
         wait_ns = START_NS if command else 0
@@ -128,21 +137,27 @@ def apply_plan(
         if command:
             run.command = start_command(command, stdout=command_stdout)
         await_nodes(
-            found, plan, wait_ns, command=run.command, stop=stop, go_on=go_on, progress=progress
+            run_threads,
+            plan,
+            wait_ns,
+            command=run.command,
+            stop=stop,
+            go_on=go_on,
+            progress=progress,
         )
         run.guardians.await_ready(go_on)
-        notes = _schedule(found, plan, choice.name, recordings)
+        notes = _schedule(run_threads, plan, choice.name, recordings)
         report = _begin_report(journal, choice, plan, command, plan_path)
-        note_strangers(report, found.latest)
-        note_absent(report, plan, found.latest, found.unread)
-        report.note(*notes, *(note for note in found.latest.notes if note.endswith(IN_ORDER)))
-        _find_anchor(anchored, found, report, phase_ns, go_on=go_on, progress=progress)
-        table = threads.server_table(anchored.plan)
+        note_strangers(report, run_threads.latest)
+        note_absent(report, plan, run_threads.latest, run_threads.unread)
+        report.note(*notes, *(note for note in run_threads.latest.notes if note.endswith(IN_ORDER)))
+        _find_anchor(anchored, run_threads, report, phase_ns, go_on=go_on, progress=progress)
+        table = server_table(anchored.plan)
         servers = run.servers = make_back_end(choice.name, table, journal, go_on)
         followers = run.followers = Followers(anchored, servers)
         supervision = Supervision(
             anchored=anchored,
-            threads=found,
+            threads=run_threads,
             report=report,
             phases=run.phases,
             followers=followers,
@@ -155,7 +170,7 @@ def apply_plan(
         )
         _arm(supervision, progress)
         report.note(*why_not)
-        followers.start(found.latest, reaches_ns)
+        followers.start(run_threads.latest, reaches_ns)
         supervision.watch_over(watch)
         strangers = look_alikes(journal, groups_of(run_of(journal)))
     finally:
@@ -180,7 +195,7 @@ class _Run:
     origins: OriginWatches = field(default_factory=OriginWatches)
 
     def put_back(self) -> None:
-        """Everything as it was: first let all threads go, then end our command, then the rest."""
+        """Put everything back: first let all threads go, then end our command, then the rest."""
         problems: list[str] = []
         self.origins.end()
         if self.followers is not None:
@@ -193,6 +208,8 @@ class _Run:
         self.phases.end()
         if self.command is not None:
             end_command(self.command)
+        if self.command is not None or self.followers is not None:
+            remove_abandoned_pages()  # what a follower had open its own run has left
         put_back(self.journal, self.guardians, problems)
 
 
@@ -205,16 +222,16 @@ def _claim(plan: Plan, folder: Path | None, go_on: Callable[[], None]) -> Journa
 
 
 def _schedule(
-    found: RunThreads, plan: Plan, back_end: str, recordings: "Sequence[Recording]"
+    run_threads: RunThreads, plan: Plan, back_end: str, recordings: "Sequence[Recording]"
 ) -> list[str]:
     """Give the threads their priorities and cores, unless the plan does not fit them.
 
     Returns what a person must know. Raises InputError, PlatformError: it does not fit.
     """
-    threads.refuse_simulated(plan, found.latest)
-    threads.refuse_other_clocks(plan, found.latest)
-    notes = threads.check_publishers(plan, found.latest, recordings)
-    return notes + waiting_receivers(plan, found.schedule(plan, back_end))
+    refuse_simulated(plan, run_threads.latest)
+    refuse_other_clocks(plan, run_threads.latest)
+    notes = check_publishers(plan, run_threads.latest, recordings)
+    return notes + waiting_receivers(plan, run_threads.schedule(plan, back_end))
 
 
 def _begin_report(
@@ -238,7 +255,7 @@ def _begin_report(
 
 def _find_anchor(
     anchored: AnchoredPlan,
-    found: RunThreads,
+    run_threads: RunThreads,
     report: RunReport,
     phase_ns: int | None,
     *,
@@ -251,7 +268,7 @@ def _find_anchor(
         go_on()
         progress(share, "measuring where in a cycle the chain begins")
 
-    phases = anchored.measure(found.latest, phase_ns, measured)
+    phases = anchored.measure(run_threads.latest, phase_ns, measured)
     for chain, phase in zip(anchored.given.chains, phases, strict=False):
         if phase.spread_ns > LEAD_NS:
             report.note(

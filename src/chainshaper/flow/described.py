@@ -10,8 +10,9 @@ from pathlib import Path
 from chainshaper.enforcement.back_ends import choose_back_end, make_back_end
 from chainshaper.enforcement.guardian import run_claimed
 from chainshaper.flow.drift import SlotFollower
+from chainshaper.flow.followed_chains import followed_chains
 from chainshaper.flow.plan import plan_recording
-from chainshaper.flow.threads import followed_chains, table_of
+from chainshaper.flow.server_tables import table_of
 from chainshaper.planning import ChainPlan, PlanRequest, save_plan
 from chainshaper.planning.chain_plan import Server, Thread
 from chainshaper.planning.plan import Plan, open_until_done
@@ -78,49 +79,55 @@ def shape_application(
 
 
 def gated_threads(plan: Plan) -> list[tuple[Server, list[Thread]]]:
-    """The servers without which a plan does not do what it says, and whom they gate: publishers,
-    stages of pipelines, and where servers close at their slots' ends all that is in them, but for
-    shaping nodes that see to their slots themselves.
+    """Return the servers without which a plan does not do what it says, and the threads they gate.
+
+    These are publishers, stages of pipelines, and where servers close at their slots' ends all
+    that is in them, but for shaping nodes that see to their slots themselves.
     """
     gates = {node.thread for node in plan.shaping_nodes}
-    closed, staged = (
-        {thread for chain in chains for server in chain.servers for thread in server.threads}
-        for chains in (
-            [chain for chain in plan.chains if chain.slot_ends == "closed"],
-            [chain for chain in plan.chains if chain.policy == "pipelined"],
-        )
-    )
+    closed = _threads_in([chain for chain in plan.chains if chain.slot_ends == "closed"])
     closed -= plan.free_threads
+    staged = _threads_in([chain for chain in plan.chains if chain.policy == "pipelined"])
+    gating = list[tuple[Server, list[Thread]]]()
+    for server in open_until_done(plan).servers:
+        has_gate = not gates.isdisjoint(server.threads)
+        gated = [
+            thread
+            for thread in server.threads
+            if thread in closed
+            or (not has_gate and (thread.role == "publisher" or thread in staged))
+        ]
+        if gated:
+            gating.append((server, gated))
+    return gating
 
-    def is_gated(thread: Thread, server: Server) -> bool:
-        needed = thread.role == "publisher" or thread in staged
-        return thread in closed or (needed and gates.isdisjoint(server.threads))
 
-    return [
-        (server, gated)
-        for server in open_until_done(plan).servers
-        if (gated := [thread for thread in server.threads if is_gated(thread, server)])
-    ]
+def _threads_in(chains: Sequence[ChainPlan]) -> set[Thread]:
+    """Return the threads in the servers of some chains."""
+    return {thread for chain in chains for server in chain.servers for thread in server.threads}
 
 
 @contextmanager
 def threads_gated(plan: Plan, nodes: StartedNodes) -> Iterator[None]:
-    """Inside, the :func:`gated_threads` of a plan run in the slots of their servers only (paper,
-    section 3.2.1, design 1).
+    """Gate the :func:`gated_threads` of a plan, until the context ends.
+
+    They run in the slots of their servers only (paper, section 3.2.1, design 1).
 
     Raises PlatformError: threads cannot be frozen here. OperationError: another run governs one of
     the cores or nodes, a node has no such thread, or the servers failed meanwhile.
     """
-    choice = choose_back_end("freezer")  # the others want threads of the fair class
-    planned = gated_threads(plan)
-    table = table_of(plan.cycle_ns, (server for server, _ in planned))
-    cores = {server.core for server, _ in planned}
-    with run_claimed(cores, {one.node for _, own in planned for one in own}) as journal:
+    choice = choose_back_end("freezer")  # other back ends need threads of the fair class
+    gating = gated_threads(plan)
+    table = table_of(plan.cycle_ns, (server for server, _ in gating))
+    cores = {server.core for server, _ in gating}
+    governed = {thread.node for _, threads in gating for thread in threads}
+    with run_claimed(cores, governed) as journal:
         servers = make_back_end(choice.name, table, journal)
         try:
-            for server, one in ((server, one) for server, own in planned for one in own):
-                for tid in _threads_of(one, nodes):
-                    servers.assign(tid, server.name)
+            for server, threads in gating:
+                for thread in threads:
+                    for tid in _threads_of(thread, nodes):
+                        servers.assign(tid, server.name)
             servers.arm(nodes.start_ns if plan.moves_timers else nodes.anchor_ns)
             yield
             failure = servers.failure()
@@ -137,10 +144,14 @@ def slots_followed(
     enforcement: Enforcement | None,
     nodes: StartedNodes,
 ) -> Iterator[None]:
-    """Inside, slots of gates follow latencies within their reach. Raises as ``enforcement``."""
+    """Have slots of gates follow latencies within their reach, until the context ends.
+
+    ``enforcement`` is entered as well, if there is one; raises as that does.
+    """
     anchor_ns = nodes.start_ns if plan.moves_timers else nodes.anchor_ns
 
-    def from_when(chain: ChainPlan, _: int) -> int:
+    def in_force_from(chain: ChainPlan, _: int) -> int:
+        """From the middle of the second cycle from now on, where no slot is (ns)."""
         since = time.monotonic_ns() + 2 * chain.cycle_ns
         return since + (anchor_ns + chain.offset_ns + chain.cycle_ns // 2 - since) % chain.cycle_ns
 
@@ -149,30 +160,34 @@ def slots_followed(
             until.enter_context(enforcement(nodes))
         followers = []
         for place, reach_ns in reaches_ns.items():
-            chain, pids = plan.chains[place], nodes.pids.values()
-            followers.append(SlotFollower(chain, pids, reach_ns, partial(from_when, chain)))
-            until.callback(followers[-1].end)
+            chain = plan.chains[place]
+            in_force = partial(in_force_from, chain)
+            follower = SlotFollower(chain, nodes.pids.values(), reach_ns, in_force)
+            followers.append(follower)
+            until.callback(follower.end)
         yield
     for follower in followers:
         if follower.failure is not None:
             raise follower.failure
 
 
-def _threads_of(wanted: Thread, nodes: StartedNodes) -> list[int]:
-    pid = nodes.pids.get(wanted.node)
-    found = [t.tid for t in node_threads(pid) if t.role == wanted.role] if pid is not None else []
-    if not found and wanted.role == "executor":
-        raise OperationError(f"{wanted.node} of the plan is no node of the application")
-    if not found:
+def _threads_of(planned: Thread, nodes: StartedNodes) -> list[int]:
+    """Return the threads that run for a thread of the plan. Raises OperationError: none does."""
+    pid, tids = nodes.pids.get(planned.node), list[int]()
+    if pid is not None:
+        tids = [thread.tid for thread in node_threads(pid) if thread.role == planned.role]
+    if not tids and planned.role == "executor":
+        raise OperationError(f"{planned.node} of the plan is no node of the application")
+    if not tids:
         raise OperationError(
-            f"{wanted.node} has no thread that publishes for it: let it publish asynchronously "
+            f"{planned.node} has no thread that publishes for it: let it publish asynchronously "
             "(`publication: asynchronous` under `topics`), or plan with --publication synchronous"
         )
-    return found
+    return tids
 
 
 def synthetic_chain() -> Path:
-    """The description of the paper's synthetic chain (section 2.5)."""
+    """Return the description of the paper's synthetic chain (section 2.5)."""
     return Path(str(resources.files("chainshaper") / "examples" / "synthetic_chain.yaml"))
 
 
@@ -187,8 +202,10 @@ def run_demo(
     planned: Callable[[Plan], None] = lambda _: None,
     progress: Progress = lambda *_: None,
 ) -> Comparison:
-    """Run an application, plan, shape, run again and compare the recordings `before` and `after` in
-    ``folder``, beside `application.yaml`, `plan.yaml`, and the comparison's figures.
+    """Run an application, plan, shape, run again and compare.
+
+    The recordings `before` and `after` are in ``folder``, beside `application.yaml`, `plan.yaml`,
+    and the comparison's figures.
 
     Raises InputError: ``folder`` exists and is not empty, or the application is not right.
     PlatformError, OperationError: a step failed; complete recordings stay, without one nothing.
@@ -198,9 +215,9 @@ def run_demo(
     description = load_application(path)
 
     def part(start: float, title: str) -> Progress:
-        return lambda done, what: progress(start + 0.48 * done, f"{title}, {what}")
+        return lambda done, doing: progress(start + 0.48 * done, f"{title}, {doing}")
 
-    made, copy = not folder.exists(), folder / "application.yaml"
+    is_new, copy = not folder.exists(), folder / "application.yaml"
     report = part(0.0, "unshaped run")
     try:
         folder.mkdir(exist_ok=True)
@@ -218,7 +235,7 @@ def run_demo(
     finally:
         if not (folder / "before").exists():  # nothing came to stand beside it
             copy.unlink(missing_ok=True)
-            if made and folder.exists():
+            if is_new and folder.exists():
                 folder.rmdir()
     progress(0.48, "planning")
     plan = plan_recording(before, request=request)

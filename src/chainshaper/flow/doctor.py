@@ -24,7 +24,7 @@ from chainshaper.values.recording import Check, MachineReport, State
 
 
 def examine_machine(watch_ns: int = 5_000_000_000) -> MachineReport:
-    """Examine this machine; the stalls take ``watch_ns``."""
+    """Examine this machine; watching it for stalls takes ``watch_ns``."""
     from chainshaper.workload.stall_meter import measure_stalls
 
     realtime = may_use_fifo()
@@ -34,9 +34,10 @@ def examine_machine(watch_ns: int = 5_000_000_000) -> MachineReport:
 
 
 def _scheduling_checks(realtime: bool) -> Iterator[Check]:
+    """Yield checks of cores and of real-time threads, which are permitted if ``realtime``."""
     cores, throttled = available_cores(), throttle_fraction()
     lockable, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
-    others, limits = foreign_realtime_processes(), "in /etc/security/limits.conf"
+    foreign, limits = foreign_realtime_processes(), "in /etc/security/limits.conf"
     text = f"{len(cores)} ({', '.join(map(str, cores))}), kernel {platform.release()}"
     good, remedy = text if len(cores) >= 2 else None, "use a machine with two cores or more"
     yield _check("cores", "DDS threads beside executors", good, "limited", text, remedy)
@@ -45,25 +46,27 @@ def _scheduling_checks(realtime: bool) -> Iterator[Check]:
     remedy = f"run as root, or give your user an rtprio limit of 98 {limits}"
     yield _check("SCHED_FIFO", purpose, good, "absent", "not permitted", remedy)
     purpose, good = "cores that real-time threads fill", "off" if throttled >= 1.0 else None
-    found = f"real-time threads are stopped at {throttled:.0%} of a core"
+    text = f"real-time threads are stopped at {throttled:.0%} of a core"
     remedy = "stay below it, or: sysctl kernel.sched_rt_runtime_us=-1"
-    yield _check("real-time throttling", purpose, good, "limited", found, remedy)
+    yield _check("real-time throttling", purpose, good, "limited", text, remedy)
     unlimited = os.geteuid() == 0 or lockable == resource.RLIM_INFINITY
     purpose, good = "no page faults while a gate waits", "permitted" if unlimited else None
-    found, remedy = f"up to {lockable // 1024} KiB", f"give your user an unlimited one {limits}"
-    yield _check("memory locking", purpose, good, "limited", found, remedy)
+    text, remedy = f"up to {lockable // 1024} KiB", f"give your user an unlimited one {limits}"
+    yield _check("memory locking", purpose, good, "limited", text, remedy)
     name, purpose = "other real-time processes", "undisturbed measurements"
     remedy = "end them while you measure, unless they belong to the application"
-    yield _check(name, purpose, None if others else "none", "limited", ", ".join(others), remedy)
+    good = None if foreign else "none"
+    yield _check(name, purpose, good, "limited", ", ".join(foreign), remedy)
 
 
 def _tool_checks() -> Iterator[Check]:
+    """Yield checks of DDS, back ends, tracers and compilers."""
     yield _dds()
     yield from _middleware()
     for offer in offered_back_ends():  # what `chainshaper apply` can use here, strongest first
-        found, _, remedy = (offer.missing or "").partition(": ")
+        missing, _, remedy = (offer.missing or "").partition(": ")
         good = "can be used" if offer.missing is None else None
-        yield _check(f"back end {offer.name}", offer.strength, good, "absent", found, remedy)
+        yield _check(f"back end {offer.name}", offer.strength, good, "absent", missing, remedy)
     yield _bpftrace()
     for name, purpose, remedy in (
         ("lttng", "recording ROS 2 with LTTng", "apt install lttng-tools"),
@@ -75,7 +78,7 @@ def _tool_checks() -> Iterator[Check]:
 
 
 def _bpftrace() -> Check:
-    """Whether bpftrace is there and works: without tracefs it finds no trace points."""
+    """Check whether bpftrace is there and works: without tracefs it finds no trace points."""
     name, purpose, environment = "bpftrace", "recording ROS 2 without LTTng", tool_environment()
     path = shutil.which(name, path=environment["PATH"])
     if path is None:
@@ -94,17 +97,18 @@ def _bpftrace() -> Check:
     remedy = "mount -t tracefs tracefs /sys/kernel/tracing"
     if Path("/sys/kernel/tracing/events").is_dir():
         remedy = "see what bpftrace says: a kernel with BTF and uprobes is needed"
-    found = f"does not work: {problems[0] if problems else 'no reason given'}"
-    return _check(name, purpose, good, "limited", found, remedy)
+    text = f"does not work: {problems[0] if problems else 'no reason given'}"
+    return _check(name, purpose, good, "limited", text, remedy)
 
 
 def _dds() -> Check:
-    found, problem = None, ""
+    """Check whether Cyclone DDS is installed and can be loaded."""
+    good, problem = None, ""
     try:
         version = importlib.metadata.version("cyclonedds")
         from chainshaper.workload import dds  # noqa: F401 - loading it is the check
 
-        found = version
+        good = version
     except Exception as error:
         problem = str(error)
     remedy = (
@@ -112,34 +116,34 @@ def _dds() -> Check:
         "exists, or `pip install cyclonedds` with CYCLONEDDS_HOME naming a Cyclone DDS 11"
     )
     purpose = "the live workload and `chainshaper demo`"
-    return _check("Cyclone DDS for Python", purpose, found, "absent", problem, remedy)
+    return _check("Cyclone DDS for Python", purpose, good, "absent", problem, remedy)
 
 
 def _middleware() -> Iterator[Check]:
-    """What is limited on the middleware that the environment chooses; no check without ROS 2."""
+    """Yield a check of the middleware that the environment chooses; without ROS 2, none."""
     distribution = os.environ.get("ROS_DISTRO")
     rmw = os.environ.get("RMW_IMPLEMENTATION")
     if not rmw:
         if not distribution:
             return
         rmw = DEFAULT_MIDDLEWARE.rmw
-    good, found = None, f"{rmw} is not known"
+    good, limited = None, f"{rmw} is not known"
     middleware = middleware_of(rmw)
     if middleware is not None:
         limit = limit_by_settings(middleware, distribution, os.environ)
         if limit is None:
             good = rmw
         else:
-            found = MIDDLEWARE_LIMITS[limit]
+            limited = MIDDLEWARE_LIMITS[limit]
     purpose = "delivery threads, in their place beside a chain"
     remedy = "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp, or measure what `shape` makes of it"
-    yield _check("middleware", purpose, good, "limited", found, remedy)
+    yield _check("middleware", purpose, good, "limited", limited, remedy)
 
 
 def _check(  # noqa: PLR0917 - a check's columns
-    name: str, purpose: str, good: str | None, state: State, found: str, remedy: str
+    name: str, purpose: str, good: str | None, state: State, bad: str, remedy: str
 ) -> Check:
-    """``good`` is what was found; None: the check's state, what was found, and the remedy."""
+    """Return a check: ``good`` says what is there; None: ``bad`` says it, and why not all works."""
     if good is None:
-        return Check(name, state, found, purpose, remedy)
+        return Check(name, state, bad, purpose, remedy)
     return Check(name, "good", good, purpose)

@@ -40,23 +40,20 @@ MOST_RATE = 500e-6  # of a quartz, and of timers that a program counts itself
 
 @dataclass
 class TimerTrack:
-    """Where a timer expires, and where slots open for it; ns behind the first such opening.
+    """Where a timer expires, and where slots open for it (ns behind the first such opening)."""
 
-    ``lead_ns`` is how long before the opening the timer is to expire. ``sightings`` are when
-    (CLOCK_MONOTONIC) and where it did. Unless it ``looks``, slots never open before it to see it.
-    """
-
-    lead_ns: int
-    at_ns: int
+    lead_ns: int  # how long before the opening the timer is to expire
+    at_ns: int  # when the first opening was (CLOCK_MONOTONIC)
     cycle_ns: int
-    looks: bool = True
-    opens_ns: int = 0
-    sightings: list[tuple[int, int]] = field(init=False)
-    _step_ns: int = 0  # while it is looked for: so much earlier the next time
-    _every_ns: int = SOONEST_NS
-    _perhaps_ns: int | None = None  # where it seemed to expire, if it did not come late
-    _lost: int = 0  # how often it was not where it can be
-    _let_go: deque[int] = field(default_factory=lambda: deque(maxlen=USUAL))  # by slots, so late
+    looks: bool = True  # whether slots may open before the timer to see it
+    opens_ns: int = 0  # where slots open
+    sightings: list[tuple[int, int]] = field(init=False)  # when (CLOCK_MONOTONIC), and where it did
+    _step_ns: int = 0  # while the timer is looked for: slots open so much earlier the next time
+    _every_ns: int = SOONEST_NS  # how long after the last sighting the timer is looked for again
+    _perhaps_ns: int | None = None  # where the timer seemed to expire, if the thread was not late
+    _lost: int = 0  # how often in turn the timer was seen where it cannot be
+    # How late the thread began, the latest times that a slot let it go.
+    _let_go: deque[int] = field(default_factory=lambda: deque(maxlen=USUAL))
 
     def __post_init__(self) -> None:
         self.sightings = [(self.at_ns, -self.lead_ns)]
@@ -69,16 +66,20 @@ class TimerTrack:
 
     @property
     def is_unsure(self) -> bool:
-        """Whether to look again soon, before the timer has moved: it is being looked for."""
+        """Whether the timer is being looked for: look again soon, before it has moved."""
         return self._perhaps_ns is not None or self._step_ns > 0
 
     def expected(self, now_ns: int) -> int:
-        """Where the timer expires now, as far as is known."""
+        """Return where the timer expires now, as far as is known."""
         _, (at, place) = self._beneath()
         return place + round(self.rate * (now_ns - at))
 
     def saw(self, begins_ns: int, now_ns: int) -> int:
-        """Where slots open from now on: the thread has begun so long behind their opening."""
+        """Take note of how long behind their opening the thread began; return where slots open now.
+
+        A thread that a slot let go says nothing. A thread that was late without reason, or that
+        began before the slot, was woken by its timer.
+        """
         expires_ns, expected = self.opens_ns + begins_ns, self.expected(now_ns)
         perhaps_ns, self._perhaps_ns = self._perhaps_ns, None
         furthest = self._furthest(now_ns - self.sightings[-1][0])
@@ -109,7 +110,7 @@ class TimerTrack:
         return self.opens_ns
 
     def _beneath(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """The edge of the lower convex hull of all sightings that has their middle in it."""
+        """Return the edge of the lower convex hull of all sightings that has their middle in it."""
         hull: list[tuple[int, int]] = []
         for at, place in self.sightings:
             while len(hull) > 1:
@@ -123,11 +124,11 @@ class TimerTrack:
         return next(edges, (hull[0], hull[0]))
 
     def _furthest(self, elapsed_ns: int) -> int:
-        """How far from where it is expected the timer can be; further, the longer it is lost."""
+        """Return how far from where it is expected the timer can be: further, the longer lost."""
         return min(self.cycle_ns // 4, (4 * AHEAD_NS + round(MOST_RATE * elapsed_ns)) << self._lost)
 
     def _go_on(self, expected_ns: int, *, lost: bool) -> None:
-        """Slots behind the timer again, until it is time to look for it the next time."""
+        """Open slots behind the timer again, until it is time to look for it the next time."""
         self.opens_ns, self._step_ns = expected_ns + self.lead_ns, 0
         self._lost = self._lost + 1 if lost else 0
 
@@ -136,12 +137,19 @@ MOVES = 20  # so many of the latest moves are shown
 
 
 class SlotFollower:
-    """Has the slots of a chain's output follow its latencies, which its gate's page of memory has
-    (:class:`~chainshaper.planning.adaptation.Tail`), in a thread of its own.
+    """Has the slots of a chain's output follow its latencies, in a thread of its own.
 
-    ``pids`` are processes of which one may be the gate, ``reach_ns`` is how far slots may be moved.
-    ``put_in_force`` has servers move theirs by so much, and says from when on the gate has to.
-    It may end by itself, with a ``failure``. Raises OperationError: see :class:`.FollowedOutput`.
+    The gate's page of memory has the latencies, from which
+    :class:`~chainshaper.planning.adaptation.Tail` says where slots shall be. The thread may end by
+    itself, with a ``failure``.
+
+    * ``pids``: processes of which one may be the gate.
+    * ``reach_ns``: how far slots may be moved, earlier and later.
+    * ``put_in_force``: has servers move their slots by so much (ns), and returns from when on the
+      gate has to move its own.
+    * ``cores``: where the thread runs; none: anywhere.
+
+    Raises OperationError: see :class:`.FollowedOutput`.
     """
 
     def __init__(
@@ -159,22 +167,28 @@ class SlotFollower:
         assert chain.shaping_node is not None  # noqa: S101 - else the chain cannot be followed
         self._output = FollowedOutput(chain.shaping_node.output, pids)
         self._planned_ns = publish_slots(chain)[-1][0]
-        earliest, latest = (self._planned_ns + by for by in reach_ns)
-        promised = allowed_late_share(chain.margin)
-        usual, rules = chain.evidence.mean_latency_ns, chain.adaptation or Adaptation()
-        cycle_ns = math.inf if chain.policy == "pipelined" else chain.cycle_ns
-        self._tail = Tail(rules, promised, self._planned_ns, usual, latest, earliest, cycle_ns)
+        earliest_ns, latest_ns = (self._planned_ns + moved_ns for moved_ns in reach_ns)
+        self._tail = Tail(
+            chain.adaptation or Adaptation(),
+            allowed_late_share(chain.margin),
+            self._planned_ns,
+            chain.evidence.mean_latency_ns,
+            latest_ns,
+            earliest_ns,
+            math.inf if chain.policy == "pipelined" else chain.cycle_ns,
+        )
         self._cores, self._stop = cores, threading.Event()
         self._thread = threading.Thread(target=self._follow, name="slot-follower", daemon=True)
         self._thread.start()
 
     def end(self) -> None:
-        """The slots go back to where the plan has them."""
+        """Have the slots go back to where the plan has them, and follow no more."""
         self._stop.set()
         self._thread.join()
         self._output.close()
 
     def _follow(self) -> None:
+        """Move the slots whenever latencies say so, until the end."""
         if self._cores:
             os.sched_setaffinity(0, self._cores)  # the calling thread's alone
         look_s = min(0.1, max(0.005, self._chain.cycle_ns / 2e9))
@@ -192,6 +206,7 @@ class SlotFollower:
             self.failure = OperationError(f"following has failed ({type(error).__name__}: {error})")
 
     def _move(self, start_ns: int, before_ns: int) -> None:
+        """Move the slots, so that the last one opens at ``start_ns`` in place of ``before_ns``."""
         moved_ns = start_ns - self._planned_ns
         from_ns = self._put_in_force(moved_ns)
         self._output.move(moved_ns, from_ns)

@@ -22,7 +22,7 @@ from chainshaper.verify.measure import opened
 def list_chains(
     source: Recording | DataFlow, start: str | None = None, end: str | None = None, limit: int = 100
 ) -> ChainEnumeration:
-    """The chains of a recording, and the heaviest of them by mean response times."""
+    """Return the chains of a recording, and the heaviest of them by mean response times."""
     if isinstance(source, Recording):
         source = recorded_flow(source)
     statistics = callback_statistics(source).drop_nulls("response_ns")
@@ -32,7 +32,10 @@ def list_chains(
 
 
 def named_chain(file: str | Path, name: str | None = None) -> str:
-    """The chain that a CARET architecture file calls ``name``, which only one path needs not."""
+    """Return the chain that a CARET architecture file calls ``name``.
+
+    A file with a single path needs no name. Raises InputError: there is no such path.
+    """
     paths = load_named_paths(file)
     known = ", ".join(paths)
     if not paths:
@@ -49,8 +52,9 @@ def named_chain(file: str | Path, name: str | None = None) -> str:
 
 
 def convert_recording(recording: Recording | str | Path, output: str | Path) -> Recording:
-    """Write a trace as a recording of ours: every figure stays the same to the nanosecond. A note
-    names the events that the analysis does not know.
+    """Write a trace as a recording of ours: every figure stays the same to the nanosecond.
+
+    A note names the events that the analysis does not know.
 
     Raises InputError: ``output`` exists already, or no event is known.
     """
@@ -61,21 +65,24 @@ def convert_recording(recording: Recording | str | Path, output: str | Path) -> 
 
 
 def with_trace_events(recording: Recording) -> RecordingInfo:
-    """A trace's description with the events it had, and a note about those that are left out."""
+    """Return a trace's description with the events it had, and a note about those left out."""
     info = recording.info
     if info.source != "lttng" or info.trace_events:
         return info
     counts = dict(event_counts(recording).iter_rows())
-    left = [name for name in counts if table_name(name) not in recording.events]
+    left_out = [name for name in counts if table_name(name) not in recording.events]
     notes = info.notes
-    if left:
-        what = "events of kinds that chainshaper makes no use of were left out"
-        notes += (f"{sum(counts[name] for name in left)} {what}: {', '.join(left)}.",)
+    if left_out:
+        number = sum(counts[name] for name in left_out)
+        notes += (
+            f"{number} events of kinds that chainshaper makes no use of were left out:"
+            f" {', '.join(left_out)}.",
+        )
     return info.model_copy(update={"trace_events": counts, "notes": notes})
 
 
 def describe_application(recording: Recording | str | Path) -> ApplicationDescription:
-    """The application that a recording or trace shows: its graph and its services."""
+    """Return the application that a recording or trace shows: its graph and its services."""
     recording = opened(recording)
     flow = recorded_flow(recording)
     return ApplicationDescription(

@@ -39,7 +39,7 @@ from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.node_kinds import language_of
 from chainshaper.splicing.node_packages import build_package, check_build_tools
 from chainshaper.splicing.shaped_outputs import remove_abandoned_pages
-from chainshaper.splicing.spliced_launch import NODES, parse_launch_command
+from chainshaper.splicing.spliced_launch import NODES, LaunchCommand, parse_launch_command
 from chainshaper.values.application import ApplicationGraph
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import NodeChoice
@@ -52,7 +52,7 @@ NOT_PERMITTED = "measured under ordinary scheduling: SCHED_FIFO is not permitted
 
 @dataclass(frozen=True)
 class ShapedLaunch:
-    """What came of it; everything lies in ``folder`` too."""
+    """The results of shaping a launched application; all of them lie in ``folder`` too."""
 
     folder: Path
     chain: str  # the first
@@ -65,7 +65,8 @@ class ShapedLaunch:
     cores: Mapping[str, int]  # where each node's executor ran
 
 
-Choose: TypeAlias = Callable[[ApplicationGraph, ChainEnumeration], str]  # which chain is meant
+Choose: TypeAlias = Callable[[ApplicationGraph, ChainEnumeration], str]
+"""Which of the chains in a graph the user means, by its words."""
 
 
 def shape_launch(
@@ -94,12 +95,13 @@ def shape_launch(
 ) -> ShapedLaunch:
     """Measure chains of a launched application, plan, splice, apply, and measure again.
 
-    ``chain`` is the one to shape, or several; without it, ``choose`` is asked. ``sinks`` are chains
-    to further outputs of the graph of one chain, ``throttled`` inputs with the nodes that get them
-    by way of a throttler, from the first recording on. ``request.cores`` are where executors run
-    (default: the last core, and others that are worth it). The application is launched briefly, and
-    for ``duration_ns`` before and after. ``planned`` gets the plan before it is used. ``stop`` ends
-    everything. The rest is for :func:`.profile_chains` and :func:`.apply_plan`.
+    ``chain`` is the chain to shape, or several; without it, ``choose`` is asked. ``sinks`` are
+    chains to further outputs of the graph of one chain, ``throttled`` inputs with the nodes that
+    get them by way of a throttler, from the first recording on. ``request.cores`` are where
+    executors run (default: the last core, and others that are worth it). The application is
+    launched briefly, and for ``duration_ns`` before and after. ``planned`` gets the plan before it
+    is used. ``stop`` ends everything. The rest is for :func:`.profile_chains` and
+    :func:`.apply_plan`.
 
     Raises InputError: ``folder`` is not empty, the command is not `ros2 launch`, or what it
     launches does not fit. PlatformError, OperationError: there is no such core, or a step failed;
@@ -112,21 +114,14 @@ def shape_launch(
         check_build_tools()
     folder, user_ids = refuse_existing(folder), run_users(users)
     folder.mkdir(exist_ok=True)
-    recorder = _Recorder(folder, source, stop or threading.Event(), progress)
-    shaped, setup = list(command), list[str]()
+    recorder = _Recorder(folder, source, duration_ns, stop or threading.Event(), progress)
+    launched = _Launched(tuple(command), launch)
     if throttled:
         request = replace(request, anchor="cycle")  # messages have the stamps of their sensors
-        inputs = launch_splicing.splice_throttlers(
-            throttled, [launch.file], folder / "throttled", node=node, builds=True
-        )
-        launch, setup = replace(launch, file=next(iter(inputs.launch.values()))), _sourced(inputs)
-        shaped = [*setup, *launch.with_file(launch.file)]
-    first = recorder.record("first", shaped, FIRST_LOOK_NS)
-    chains = chains or [_chosen(first, choose)]
-    wanted = (*chains, *sinks)
-    seen, core_of = profiled_cores(first, wanted, request, period_ns)
-    _refuse_at_first_look(seen, len(chains), request)
-    look = _FirstLook(first, wanted, seen, core_of)
+        launched = _with_throttlers(launched, throttled, folder / "throttled", node)
+    look = _first_look(
+        recorder, launched, chains, sinks, choose=choose, request=request, period_ns=period_ns
+    )
     profile = partial(
         profile_chains,
         period_ns=period_ns,
@@ -135,69 +130,51 @@ def shape_launch(
         modes=request.modes,
         mode_recordings=mode_recordings or {},
     )
-    notes: list[str] = []
-    measured = _measured(
-        recorder,
-        shaped,
-        duration_ns=duration_ns,
-        look=look,
-        request=request,
-        profile=profile,
-        notes=notes,
-    )
+    before = _measured_before(recorder, launched, look, request, profile)
     progress(0.0, "planning")
-    profiles = [measured[place].profile for place in range(len(wanted))]
-    plan, remarks = _planned(profiles, len(chains), request)
+    plan, doubts = _planned(before.profiles, look.chains, request)
     planning.save_plan(plan, folder / "plan.yaml")
     planned(plan)
-    notes += remarks
+    notes = [*before.notes, *doubts]
     splicing = None
     if plan.shaping_nodes:
-        recordings = [first, *(chain.recording for chain in measured.values())]
-        splicing = launch_splicing.splice_launch_files(
-            plan,
-            [launch.file],
-            folder / "launch",
-            node=node,
-            builds=True,
-            recording=_with_types(recordings, plan),
-        )
+        recordings = [look.recording, *before.recordings]
+        splicing = _with_shaping_nodes(launched, plan, folder / "launch", node, recordings)
+        launched = launched.launching(splicing)
         notes += splicing.notes
-        shaped = [*setup, *_sourced(splicing), *launch.with_file(*set(splicing.launch.values()))]
     in_force = plan_in_force(
-        plan, back_end, first, user_ids, notes, adapt=adapt, max_latency_ns=max_latency_ns
+        plan, back_end, look.recording, user_ids, notes, adapt=adapt, max_latency_ns=max_latency_ns
     )
-    try:
-        after = recorder.record(
-            "after",
-            shaped,
-            duration_ns,
-            scheduling=in_force,
-            plan=plan,
-            gate_logs=() if splicing is None else splicing.logs,
-            chain=chains[0],
-        )
-    finally:
-        remove_abandoned_pages()  # of the shaping nodes, which have ended
+    after = _recorded_after(recorder, launched, plan, splicing, in_force, chain=look.wanted[0])
     progress(0.0, "comparing")
-    comparisons = [
-        compare_recordings([measured[place].recording, after], chain_or_sink)
-        for place, chain_or_sink in enumerate(wanted)
-    ]
-    for place, comparison in enumerate(comparisons):
-        write_comparison(comparison, folder / f"chain_{place + 1}" if place else folder)
+    comparisons = _compared(look.wanted, before.recordings, after, folder)
     notes += after.info.notes
     return ShapedLaunch(
         folder=folder,
-        chain=chains[0],
+        chain=look.wanted[0],
         plan=plan.chains[0],
         splicing=splicing,
         comparison=comparisons[0],
         notes=tuple(dict.fromkeys(notes)),
         application=plan,
-        comparisons=tuple(comparisons),
-        cores=core_of,
+        comparisons=comparisons,
+        cores=look.core_of,
     )
+
+
+@dataclass(frozen=True)
+class _Launched:
+    """The command that launches the application, as it is at a step of the flow."""
+
+    command: tuple[str, ...]  # all words
+    launch: LaunchCommand  # the same without what is sourced before it
+    setup: tuple[str, ...] = ()  # the words before it, which source what throttlers need
+
+    def launching(self, splicing: Splicing) -> "_Launched":
+        """Return the command that launches what was spliced, in the same way."""
+        files = dict.fromkeys(splicing.launch.values())
+        words = (*self.setup, *_sourced(splicing), *self.launch.with_file(*files))
+        return replace(self, command=words)
 
 
 @dataclass(frozen=True)
@@ -205,60 +182,22 @@ class _FirstLook:
     """What the first, short recording shows of the chains and sinks that are wanted."""
 
     recording: Recording
-    wanted: tuple[str, ...]
-    profiles: Sequence[Profile]
+    chains: int  # how many of ``wanted`` are chains; the others are sinks of the first
+    wanted: tuple[str, ...]  # chains, then sinks
+    profiles: Sequence[Profile]  # of each that is wanted; empty: too little was to be seen
     core_of: Mapping[str, int]  # where each node's executor runs
 
 
 @dataclass(frozen=True)
-class _MeasuredChain:
-    """A chain's profile, and the recording that it is of."""
+class _MeasuredBefore:
+    """The chains and sinks as measured under the profiling condition, in the order of ``wanted``.
 
-    recording: Recording
-    profile: Profile
-
-
-def _measured(
-    recorder: "_Recorder",
-    command: Sequence[str],
-    *,
-    duration_ns: int,
-    look: _FirstLook,
-    request: PlanRequest,
-    profile: Callable[[Recording, Sequence[str]], tuple[Profile, ...]],
-    notes: list[str],
-) -> dict[int, _MeasuredChain]:
-    """Record the chains under the profiling condition; what was measured, by place in ``wanted``.
-
-    Chains that would delay each other are recorded one after the other. ``notes`` gets the notes of
-    the recordings, and a first one if SCHED_FIFO is not permitted.
+    Chains that were recorded together have the same recording.
     """
-    permitted = may_use_fifo()
-    if not permitted:
-        notes.append(NOT_PERMITTED)
-    measured: dict[int, _MeasuredChain] = {}
-    for number, places in enumerate(undelayed(look.profiles, look.core_of), start=1):
-        chains = [look.wanted[place] for place in places]
-        cores = {node: look.core_of[node] for node in chain_nodes(look.recording, *chains)}
-        condition = profiling_condition(
-            cores,
-            cores,
-            like=look.recording,
-            before=requests.stages_before(look.profiles, request),
-            best_effort=requests.best_effort_cores(look.profiles, request, look.core_of),
-            policy=request.policy,
-        )
-        before = recorder.record(
-            "before" if number == 1 else f"before_{number}",
-            command,
-            duration_ns,
-            scheduling=condition if permitted else None,
-            chain=chains[0],
-        )
-        notes += before.info.notes
-        for place, of_chain in zip(places, profile(before, chains), strict=True):
-            measured[place] = _MeasuredChain(before, of_chain)
-    return measured
+
+    recordings: tuple[Recording, ...]
+    profiles: tuple[Profile, ...]
+    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -267,29 +206,29 @@ class _Recorder:
 
     folder: Path
     source: Literal["lttng", "preload", "ebpf"] | None
+    duration_ns: int  # of all recordings but the first
     stop: threading.Event
     progress: Callable[[float, str], None]
 
     def record(
         self,
         name: str,
-        command: Sequence[str],
-        duration_ns: int,
+        launched: _Launched,
         *,
         scheduling: Scheduling | None = None,
         plan: Plan | None = None,
         gate_logs: Sequence[Path] = (),
         chain: str | None = None,
     ) -> Recording:
-        """Record for ``duration_ns``; the rest is as for :func:`.record_command`.
+        """Record into the folder of this name; the rest is as for :func:`.record_command`.
 
         Raises OperationError: it was stopped, or the application ended by itself.
         """
         recorded = record_command(
             self.folder / name,
-            command,
+            launched.command,
             source=self.source,
-            duration_ns=duration_ns,
+            duration_ns=FIRST_LOOK_NS if name == "first" else self.duration_ns,
             chain=chain,
             scheduling=scheduling,
             plan=plan,
@@ -316,69 +255,202 @@ def _refuse_early(
     throttled: Sequence[ThrottledInput],
     modes: bool,
 ) -> None:
-    """What need not be tried: it would be refused minutes later."""
+    """Refuse what would be refused only after minutes of recording. Raises InputError."""
     requests.refuse_contradictions(request, sinks=bool(sinks), modes=modes)
     check_cores(dict.fromkeys(request.cores or (), "--cores"))
     if sinks and len(chains) > 1:
         raise InputError("--sink goes with one chain: name each output with a --chain of its own")
-    if unknown := [one.topic for one in throttled if one.subscriber is None]:
-        raise InputError(
-            f"which node gets {unknown[0]} is not known before the first recording: name it, as in"
-            f" --throttle NODE:{unknown[0]}=PERIOD"
-        )
+    for throttled_input in throttled:
+        topic = throttled_input.topic
+        if throttled_input.subscriber is None:
+            raise InputError(
+                f"which node gets {topic} is not known before the first recording: name it, as in"
+                f" --throttle NODE:{topic}=PERIOD"
+            )
 
 
-def _refuse_at_first_look(seen: Sequence[Profile], chains: int, request: PlanRequest) -> None:
-    """What is not to be had of these chains, however long they take."""
-    requests.refuse_entangled(seen, request.policy, sinks=len(seen) > chains)
-    requests.refuse_simulated(seen, request)
-    if seen and request.policy != "shaped":
+def _with_throttlers(
+    launched: _Launched, throttled: Sequence[ThrottledInput], folder: Path, node: NodeChoice
+) -> _Launched:
+    """Splice throttlers into the launch file; return the command that launches it with them."""
+    launch = launched.launch
+    splicing = launch_splicing.splice_throttlers(
+        throttled, [launch.file], folder, node=node, builds=True
+    )
+    launch = replace(launch, file=next(iter(splicing.launch.values())))
+    setup = tuple(_sourced(splicing))
+    return _Launched((*setup, *launch.with_file(launch.file)), launch, setup)
+
+
+def _first_look(
+    recorder: _Recorder,
+    launched: _Launched,
+    chains: Sequence[str],
+    sinks: Sequence[str],
+    *,
+    choose: Choose | None,
+    request: PlanRequest,
+    period_ns: int | None,
+) -> _FirstLook:
+    """Record the application briefly, to see its chains and to choose their cores.
+
+    Raises InputError: the request cannot be fulfilled for these chains, however long they take.
+    """
+    first = recorder.record("first", launched)
+    chains = chains or [_chosen(first, choose)]
+    wanted = (*chains, *sinks)
+    profiles, core_of = profiled_cores(first, wanted, request, period_ns)
+    requests.refuse_entangled(profiles, request.policy, sinks=len(profiles) > len(chains))
+    requests.refuse_simulated(profiles, request)
+    if profiles and request.policy != "shaped":
         with suppress(OperationError):
-            _planned(seen, chains, request)
+            _planned(profiles, len(chains), request)
+    return _FirstLook(first, len(chains), wanted, profiles, core_of)
+
+
+def _chosen(first: Recording, choose: Choose | None) -> str:
+    """Return the chain that is meant, of those that were recorded."""
+    flow = recorded_flow(first)
+    enumeration = list_chains(flow)
+    if not enumeration.chains:
+        raise InputError(
+            f"{first.path}: no chain was seen: do its callbacks publish, and do others take that?"
+        )
+    if choose is None:
+        known = ", ".join(candidate.spec for candidate in enumeration.chains[:5])
+        raise InputError(f"which chain is meant? Name it with --chain: {known}")
+    return choose(graph_of(flow), enumeration)
+
+
+def _measured_before(
+    recorder: _Recorder,
+    launched: _Launched,
+    look: _FirstLook,
+    request: PlanRequest,
+    profile: Callable[[Recording, Sequence[str]], tuple[Profile, ...]],
+) -> _MeasuredBefore:
+    """Record the chains under the profiling condition, and profile them.
+
+    Chains that would delay each other are recorded one after the other. The notes are those of the
+    recordings, and a first one if SCHED_FIFO is not permitted.
+    """
+    permitted = may_use_fifo()
+    notes = [] if permitted else [NOT_PERMITTED]
+    measured: dict[int, tuple[Recording, Profile]] = {}  # by place in `wanted`
+    for number, places in enumerate(undelayed(look.profiles, look.core_of), start=1):
+        chains = [look.wanted[place] for place in places]
+        cores = {node: look.core_of[node] for node in chain_nodes(look.recording, *chains)}
+        condition = profiling_condition(
+            cores,
+            cores,
+            like=look.recording,
+            before=requests.stages_before(look.profiles, request),
+            best_effort=requests.best_effort_cores(look.profiles, request, look.core_of),
+            policy=request.policy,
+        )
+        recording = recorder.record(
+            "before" if number == 1 else f"before_{number}",
+            launched,
+            scheduling=condition if permitted else None,
+            chain=chains[0],
+        )
+        notes += recording.info.notes
+        for place, of_chain in zip(places, profile(recording, chains), strict=True):
+            measured[place] = recording, of_chain
+    recordings, profiles = zip(*(measured[place] for place in range(len(look.wanted))), strict=True)
+    return _MeasuredBefore(recordings, profiles, tuple(notes))
 
 
 def _planned(
     profiles: Sequence[Profile], chains: int, request: PlanRequest
 ) -> tuple[Plan, list[str]]:
-    """The plan for the first of the profiles and its sinks, or for all; cores as measured."""
+    """Plan the first of the profiles and its sinks, or all, on the cores where they were measured.
+
+    Returns the plan, and what a person must know about it.
+    """
     if request.policy != "pipelined":  # whose stages may have a core twice
         request = replace(request, cores=None)
-    doubts = list(dict.fromkeys(text for one in profiles[:chains] for text in doubts_about(one)))
+    texts = (text for profile in profiles[:chains] for text in doubts_about(profile))
+    doubts = list(dict.fromkeys(texts))
     if chains > 1:
         plan, remarks = planning.plan_application(profiles, request)
         return plan, remarks + doubts
     return Plan.of(planning.plan_chain(profiles[0], request, profiles[1:])), doubts
 
 
+def _with_shaping_nodes(
+    launched: _Launched,
+    plan: Plan,
+    folder: Path,
+    node: NodeChoice,
+    recordings: Sequence[Recording],
+) -> Splicing:
+    """Splice the plan's shaping nodes into the launch file."""
+    return launch_splicing.splice_launch_files(
+        plan,
+        [launched.launch.file],
+        folder,
+        node=node,
+        builds=True,
+        recording=_with_types(recordings, plan),
+    )
+
+
 def _with_types(recordings: Sequence[Recording], plan: Plan) -> Recording:
-    """The first recording by whose end discovery had shown the types of all outputs, if any."""
+    """Return the first recording by whose end discovery had shown the types of all outputs.
+
+    If none has, return the first of all.
+    """
     outputs = {node.output for node in plan.shaping_nodes}
 
-    def knows(one: Recording) -> bool:
-        return outputs <= {end.topic for end in one.info.endpoints if end.type}
+    def knows_types(recording: Recording) -> bool:
+        return outputs <= {end.topic for end in recording.info.endpoints if end.type}
 
-    return next(filter(knows, recordings), recordings[0])
-
-
-def _chosen(first: Recording, choose: Choose | None) -> str:
-    """The chain that is meant, of those that were recorded."""
-    flow = recorded_flow(first)
-    found = list_chains(flow)
-    if not found.chains:
-        what = "no chain was seen: do its callbacks publish, and do others take that?"
-        raise InputError(f"{first.path}: {what}")
-    if choose is None:
-        known = ", ".join(one.spec for one in found.chains[:5])
-        raise InputError(f"which chain is meant? Name it with --chain: {known}")
-    return choose(graph_of(flow), found)
+    return next(filter(knows_types, recordings), recordings[0])
 
 
 def _sourced(splicing: Splicing) -> list[str]:
-    """What stands before a command for the environment that our nodes need; they are built."""
+    """Build our nodes; return the words before a command that source the environment they need."""
     if all(process.package is None for process in splicing.processes):
         return []
     setup = build_package(splicing.folder / NODES)
     return ["bash", "-c", 'source "$0" && exec "$@"', str(setup)]
+
+
+def _recorded_after(
+    recorder: _Recorder,
+    launched: _Launched,
+    plan: Plan,
+    splicing: Splicing | None,
+    in_force: Scheduling,
+    *,
+    chain: str,
+) -> Recording:
+    """Record the application with its shaping nodes and the plan in force."""
+    try:
+        return recorder.record(
+            "after",
+            launched,
+            scheduling=in_force,
+            plan=plan,
+            gate_logs=() if splicing is None else splicing.logs,
+            chain=chain,
+        )
+    finally:
+        remove_abandoned_pages()  # of the shaping nodes, which have ended
+
+
+def _compared(
+    wanted: Sequence[str], before: Sequence[Recording], after: Recording, folder: Path
+) -> tuple[Comparison, ...]:
+    """Compare each chain and sink before and after, and write the figures into the folder."""
+    comparisons = tuple(
+        compare_recordings([recording, after], chain)
+        for chain, recording in zip(wanted, before, strict=True)
+    )
+    for place, comparison in enumerate(comparisons):
+        write_comparison(comparison, folder / f"chain_{place + 1}" if place else folder)
+    return comparisons
 
 
 @contextmanager
@@ -392,8 +464,7 @@ def plan_in_force(
     adapt: bool = False,
     max_latency_ns: int | None = None,
 ) -> Iterator[Callable[[Sequence[RunningProcess]], bool]]:
-    """Have a thread apply the plan to what runs, as `chainshaper apply` does, until the context
-    ends.
+    """Have a thread apply the plan to what runs, until the context ends.
 
     Yields a function that says whether all servers have opened. At the end the notes of the run
     are added to ``notes``.

@@ -60,7 +60,10 @@ def measure_phase(
     cycles: int = 12,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Phase:
-    """The phase of an executor. Raises OperationError: it ended, or does not wake up regularly."""
+    """Measure where in a cycle an executor begins.
+
+    Raises OperationError: it ended, or does not wake up regularly.
+    """
     for _ in range(MOST_TRIES):
         wake_ups = watch_wake_ups(pid, tids, cycles * cycle_ns, progress)
         if (phase := find_phase(wake_ups, cycle_ns, cycles)) is not None:
@@ -140,7 +143,7 @@ def watch_wake_ups(
 
 
 def _counters(file: FileIO) -> tuple[int, int, int]:
-    """How long a thread ran, how long it waited for a core (ns), how often it was put on one."""
+    """Return how long a thread ran, and waited for a core (ns), and how often it was put on one."""
     file.seek(0)
     ran, waited, times = map(int, file.read().split())
     return ran, waited, times
@@ -149,14 +152,14 @@ def _counters(file: FileIO) -> tuple[int, int, int]:
 def _long_enough(
     wake_ups: Sequence[tuple[int, int]], ran_in_all: int, least_ns: int
 ) -> npt.NDArray[np.int64]:
-    """The wake-ups of a thread after which it ran for at least so long."""
+    """Return the wake-ups of a thread after which it ran for at least so long."""
     when, ran_by_then = np.array([*wake_ups, (0, ran_in_all)], dtype=np.int64).T
     worked = np.diff(ran_by_then) >= least_ns
     return np.asarray(when[:-1][worked & (when[:-1] > 0)], dtype=np.int64)
 
 
 def find_phase(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> Phase | None:
-    """The place in the cycle where wake-ups come regularly after the longest rest.
+    """Return the place in the cycle where wake-ups come regularly after the longest rest.
 
         >>> find_phase(np.array([1020, 1030, 1090, 1120, 1131, 1220, 1229, 1320]), 100, 4).at_ns
         20
@@ -174,16 +177,16 @@ def find_phase(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> P
 
 
 def _width(cycle_ns: int) -> int:
-    """How far apart wake-ups of one place may lie."""
+    """Return how far apart wake-ups of one place may lie (ns)."""
     return max(1, cycle_ns // 50)
 
 
 def _places(
     wake_ups: npt.NDArray[np.int64], cycle_ns: int
 ) -> Iterator[tuple[int, int, npt.NDArray[np.int64]]]:
-    """Each place of the cycle that begins with a wake-up.
+    """Yield each place of the cycle that begins with a wake-up.
 
-    Yields how long nothing woke up before it (ns), in how many cycles something did there, and
+    Of each: how long nothing woke up before it (ns), in how many cycles something did there, and
     where in the cycle.
     """
     width, places = _width(cycle_ns), np.sort(wake_ups % cycle_ns)
@@ -205,7 +208,7 @@ def find_drift(
     expected_ns: int,
     slots: Sequence[tuple[int, int]] = (),
 ) -> int | None:
-    """How far behind ``expected_ns`` a thread begins its cycles (ns), None: it does not.
+    """Return how far behind ``expected_ns`` a thread begins its cycles (ns); None: it does not.
 
     Only wake-ups in ``slots`` count, which count from ``expected_ns``, if there are any: a thread
     that is stopped as a slot ends wakes up too.
@@ -215,7 +218,9 @@ def find_drift(
     """
     if slots:
         places = (wake_ups - expected_ns) % cycle_ns
-        wake_ups = wake_ups[np.any([(s <= places) & (places < e) for s, e in slots], axis=0)]
+        wake_ups = wake_ups[
+            np.any([(start <= places) & (places < end) for start, end in slots], axis=0)
+        ]
     phase, half = find_phase(wake_ups, cycle_ns, cycles), cycle_ns // 2
     return None if phase is None else (phase.at_ns - expected_ns + half) % cycle_ns - half
 
@@ -227,12 +232,10 @@ class DriftWatch:
     and only near where the cycle began last, unless it is not seen there. It ends with one of the
     threads, or with a failure.
 
-    latest_ns   how far the beginning is from where it is expected (None: not seen yet)
-    surely_ns   the earlier of the last two: a busy machine may delay a thread for a whole look, and
-                hastens none
-    looks       how many looks have seen the thread
-    look_soon   set it, and the next look comes after a second
-    failure     why the watch has ended, as half a sentence
+    * ``latest_ns``: how far the beginning is from where it is expected (None: not seen yet).
+    * ``looks``: how many looks have seen the thread.
+    * ``look_soon``: set it, and the next look comes after a second.
+    * ``failure``: why the watch has ended, as half a sentence.
     """
 
     EVERY_S, SOON_S = 10.0, 1.0
@@ -258,26 +261,32 @@ class DriftWatch:
         threading.Thread(target=self._look_until_over, name="drift-watch", daemon=True).start()
 
     def expect(self, expected_ns: int) -> None:
-        """The thread is to begin elsewhere from now on; what is seen of it till then is void."""
+        """Expect the thread to begin elsewhere from now on; forget where it began until now."""
         self._expected_ns, self._before_ns = expected_ns, 0
         if self.latest_ns is not None:
             self.latest_ns = 0
 
     def end(self) -> None:
-        """Look no more, when a look that is under way is over."""
+        """Look no more, once the look that is under way is over."""
         self._stop.set()
 
     @property
     def surely_ns(self) -> int | None:
+        """The earlier of the last two beginnings; None: not seen yet.
+
+        A busy machine may delay a thread for a whole look, and hastens none.
+        """
         return None if self.latest_ns is None else min(self.latest_ns, self._before_ns)
 
     def _look_until_over(self) -> None:
+        """Look again and again; note why that has failed, if it has."""
         try:
             self._look_again()
         except Exception as error:  # a thread that ends in silence sees no drift
             self.failure = f"looking for it has failed ({type(error).__name__}: {error})"
 
     def _look_again(self) -> None:
+        """Look every ten seconds, or after one if it is asked for, until the end."""
         if self._cores:
             os.sched_setaffinity(0, self._cores)  # the calling thread's alone
         near_ns: int | None = self._expected_ns
@@ -299,16 +308,23 @@ class DriftWatch:
                     self.looks += 1
 
     def _look(self, near_ns: int | None, expected_ns: int) -> int | None:
-        """The drift, if the thread was seen; near where it was expected, None: anywhere."""
+        """Return how far the thread begins from ``expected_ns``; None: it was not seen.
+
+        Look near ``near_ns`` only; None: look all the time.
+        """
         cycle_ns, near = self._cycle_ns, round(self.NEAR * self._cycle_ns)
 
         def until_near(now_ns: int) -> int:
+            """How long it is until the place near which to look (ns)."""
             place = (now_ns - (near_ns or 0) + near) % cycle_ns
             return 0 if near_ns is None or place < 2 * near else cycle_ns - place
 
         least_ns, cycles = TO_STOP_NS if self._slots else 0, self.CYCLES
+        pid, tids = self._threads
         seen = watch_wake_ups(
-            *(*self._threads, cycles * cycle_ns),
+            pid,
+            tids,
+            cycles * cycle_ns,
             least_ns=least_ns,
             rest_ns=until_near,
             poll_ns=POLL_NS if self._cores else SPARING_POLL_NS,
@@ -329,7 +345,7 @@ def _undisturbed() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Telling:
-    """Nodes that are being given the phase."""
+    """A process that gives nodes in ROS 2 the phase."""
 
     nodes: tuple[str, ...]
     script: "Script | None"  # the process that gives it to them
@@ -337,12 +353,12 @@ class Telling:
     refused: str | None = None  # why no process could be started
 
     def is_over(self) -> bool:
-        """Look whether the nodes know, or never will."""
+        """Return whether the nodes know it by now, or never will."""
         late = time.monotonic() - self.begun > _PATIENCE_S
         return self.script is None or self.script.is_over() or late
 
     def end(self) -> tuple[str, ...]:
-        """What went wrong, in words: to be called when it is over, or no longer waited for."""
+        """End the process, if it still runs; return what went wrong, in sentences."""
         problem = self.refused
         if self.script is not None:
             late = not self.script.is_over()
@@ -350,24 +366,30 @@ class Telling:
             problem = f"ROS 2 did not answer within {_PATIENCE_S} s" if late else problem
         if problem is None:
             return ()
-        named = f"{', '.join(self.nodes)} did not get where cycles begin ({problem})"
-        why = "outputs without a stamp of their chain's beginning will not be in time"
-        return (f"{named}: {why}",)
+        return (
+            f"{', '.join(self.nodes)} did not get where cycles begin ({problem}): outputs without a"
+            " stamp of their chain's beginning will not be in time",
+        )
 
 
 NO_NODE = Telling((), None, 0.0)  # none is to get a phase
 
 
-def tell_phase(nodes: Collection[ShapingNode], found: Allocation, phase_ns: int) -> Telling:
+def tell_phase(nodes: Collection[ShapingNode], allocation: Allocation, phase_ns: int) -> Telling:
     """Begin to give shaping nodes in ROS 2 where their chain begins in every cycle."""
     names = [node.thread.node for node in nodes]
-    pids = {node: one.thread.pid for node in names for one in found.threads if node in one.nodes}
+    pids = {
+        name: listed.thread.pid
+        for name in names
+        for listed in allocation.threads
+        if name in listed.nodes
+    }
     if not pids:
         return NO_NODE
-    # Who reads what ROS 2 shows reads recordings as well, which is slow to import.
+    # This reads recordings as well, which is slow to import.
     from chainshaper.sources import ros
 
-    asked, environments = tuple(pids), dict[str, ros.Environment]()
+    running, environments = tuple(pids), dict[str, ros.Environment]()
     try:
         for node in nodes:
             if node.in_process and node.thread.node in pids:
@@ -383,9 +405,9 @@ def tell_phase(nodes: Collection[ShapingNode], found: Allocation, phase_ns: int)
                 environments[name] = environment
         if not environments:
             return NO_NODE
-        ours = tuple(environments)
-        arguments = ("parameter", "phase_ns", str(phase_ns), *ours)
-        script = ros.start_with_rclpy(environments[ours[0]], ros.script.__file__, *arguments)
+        in_ros = tuple(environments)
+        arguments = ("parameter", "phase_ns", str(phase_ns), *in_ros)
+        script = ros.start_with_rclpy(environments[in_ros[0]], ros.script.__file__, *arguments)
     except OperationError as error:
-        return Telling(asked, None, 0.0, str(error))
-    return Telling(ours, script, time.monotonic())
+        return Telling(running, None, 0.0, str(error))
+    return Telling(in_ros, script, time.monotonic())

@@ -17,8 +17,9 @@ from chainshaper.enforcement.node_threads import Allocation, NodeThread, allocat
 from chainshaper.enforcement.scheduling_memory import change_all
 from chainshaper.enforcement.servers import ReservationServer
 from chainshaper.enforcement.thread_scheduling import scheduling_around
-from chainshaper.flow.plan import graph_stages, profile_chains, taking_part
-from chainshaper.flow.threads import recorded_processes
+from chainshaper.flow.plan import profile_chains
+from chainshaper.flow.recorded_processes import recorded_processes
+from chainshaper.flow.recorded_profile.stages import graph_stages, taking_part
 from chainshaper.linux.processes import RunningProcess
 from chainshaper.linux.scheduling import (
     SchedulingRequest,
@@ -50,14 +51,19 @@ def profiling_condition(
     best_effort: Mapping[str, int] = MappingProxyType({}),
     policy: Policy = "shaped",
 ) -> Iterator[Callable[[Sequence[RunningProcess]], bool]]:
-    """Have the threads of ``nodes`` (default: of all, at one priority) run as the paper profiles a
-    chain: what :func:`.record_command` wants for its ``scheduling``.
+    """Have threads run as the paper profiles a chain, until the context ends.
 
-    The first of ``nodes`` are the most urgent, as in a plan of this ``policy``. ``core`` is where
-    the executors run (default: the last that we may use), or the core of each of ``nodes``,
-    ``before`` how many stages of a pipeline are more urgent there, and ``best_effort`` the core of
-    nodes that run when these do not. ``folder`` is for journals (default: `/run/chainshaper`).
-    An earlier recording that this one is ``like`` knows components and executors' threads.
+    It is the ``scheduling`` of :func:`.record_command`.
+
+    * ``nodes``: those whose threads are scheduled, in the order of a plan of this ``policy``: the
+      first are the most urgent (default: all nodes, at one priority).
+    * ``core``: where the executors run, or the core of each node (default: the last that we may
+      use).
+    * ``folder``: for journals (default: `/run/chainshaper`).
+    * ``like``: an earlier recording of the application, which knows components and executors'
+      threads.
+    * ``before``: of each node, how many stages of a pipeline are more urgent on its core.
+    * ``best_effort``: the core of each node that runs when these do not.
 
     Raises PlatformError: no such core, or SCHED_FIFO is not permitted. OperationError: `apply`
     governs one of the nodes, or the core; a node does not appear; not all could be changed or put
@@ -67,21 +73,24 @@ def profiling_condition(
     order = tuple(nodes)[: 1 if policy in PER_CALLBACK else None]
     cores = check_profiling([core] if isinstance(core, int) else [*dict.fromkeys(core_of.values())])
     homes = {(core, before.get(node, 0)) for node, core in core_of.items()} or {(cores[0], 0)}
-    servers = {(c, k): ReservationServer(f"core {c}, {k}", c, 1 + k, ()) for c, k in homes}
+    servers = {
+        (core, rank): ReservationServer(f"core {core}, {rank}", core, 1 + rank, ())
+        for core, rank in homes
+    }
     recorded = recorded_processes(like)[0] if like is not None else ()
     begun_ns, done = time.monotonic_ns(), set[tuple[int, int]]()
     appeared = False
 
-    def see_to_it(processes: Sequence[RunningProcess]) -> bool:
-        """Give new threads what they shall have; whether all nodes have it, and nothing was new."""
+    def schedule(processes: Sequence[RunningProcess]) -> bool:
+        """Schedule new threads; return whether all nodes' threads are, and none was new."""
         nonlocal appeared
-        found = allocate(processes, recorded)
-        there = {node for one in found.threads for node in one.nodes}
-        members = executors_of(found, wanted, processes)
+        allocation = allocate(processes, recorded)
+        there = {node for listed in allocation.threads for node in listed.nodes}
+        members = executors_of(allocation, wanted, processes)
         if not members or not wanted <= there:
             # Of an application that ends, or a node that is started again, the recording goes on.
             if not appeared and time.monotonic_ns() - begun_ns > START_NS:
-                missing, running = (", ".join(sorted(n)) for n in (wanted - there, there))
+                missing, running = ", ".join(sorted(wanted - there)), ", ".join(sorted(there))
                 raise OperationError(
                     f"{f'node {missing}' if missing else 'a node'} has not appeared within"
                     f" {duration_text(START_NS)}; running: {running or 'no node'}"
@@ -89,34 +98,36 @@ def profiling_condition(
             return False
         appeared = True
         at_home: dict[str, list[NodeThread]] = {server.name: [] for server in servers.values()}
-        for one in members:
-            node = next((node for node in one.nodes if node in core_of), "")
+        for member in members:
+            node = next((node for node in member.nodes if node in core_of), "")
             server = servers[core_of.get(node, cores[0]), before.get(node, 0)]
-            at_home[server.name].append(one)
+            at_home[server.name].append(member)
         clear = cores[:1] if len(cores) > 1 else ()  # the plan's, whose output it has mostly
         around = scheduling_around(
-            *(at_home, servers.values(), found, available_cores()), order=order, clear=clear
+            at_home, servers.values(), allocation, available_cores(), order=order, clear=clear
         )
-        wishes = [(wanted.node_thread.thread, wanted.scheduling) for wanted in around]
-        wishes += [
-            (one.thread, SchedulingRequest(0, (best_effort[node],)))
-            for one in found.threads
-            if one.thread.role == "executor" and one not in members
-            for node in one.nodes
+        requests = [(planned.node_thread.thread, planned.scheduling) for planned in around]
+        requests += [
+            (listed.thread, SchedulingRequest(0, (best_effort[node],)))
+            for listed in allocation.threads
+            if listed.thread.role == "executor" and listed not in members
+            for node in listed.nodes
             if node in best_effort
         ]
-        new = [(thread, wish) for thread, wish in wishes if thread.identity not in done]
+        new = [(thread, request) for thread, request in requests if thread.identity not in done]
         change_all(journal, new)
         done.update(thread.identity for thread, _ in new)
         return not new
 
     with run_claimed(cores, nodes, folder) as journal:
-        yield see_to_it
+        yield schedule
 
 
 def check_profiling(cores: Sequence[int] | None) -> Sequence[int]:
-    """The cores on which executors will run. Raises InputError: a core is named twice.
-    PlatformError: no such core, or SCHED_FIFO is not permitted.
+    """Return the cores on which executors will run.
+
+    Raises InputError: a core is named twice. PlatformError: no such core, or SCHED_FIFO is not
+    permitted.
     """
     cores = cores or available_cores()[-1:]
     if len(set(cores)) < len(cores):
@@ -131,24 +142,29 @@ def check_profiling(cores: Sequence[int] | None) -> Sequence[int]:
 
 
 def chain_nodes(recording: Recording, *chains: str) -> tuple[str, ...]:
-    """The nodes of recorded chains, each in order, then those of the branches that it waits for."""
+    """Return the nodes of recorded chains, each in order, then those of its branches."""
     graph = graph_of(recorded_flow(recording))
-    found = ((one, graph_stages(graph, one)) for one in (find_chain(graph, c) for c in chains))
-    return tuple(dict.fromkeys(node for own in found for node in taking_part(graph, *own)))
+    nodes = list[str]()
+    for spec in chains:
+        chain = find_chain(graph, spec)
+        nodes += taking_part(graph, chain, graph_stages(graph, chain))
+    return tuple(dict.fromkeys(nodes))
 
 
 def profiled_cores(
     recording: Recording, chains: Sequence[str], request: PlanRequest, period_ns: int | None = None
 ) -> tuple[tuple[Profile, ...], dict[str, int]]:
-    """What an earlier recording shows of chains, and on which cores to profile their executors:
-    without ``request.cores`` the last, and others as far as they are worth it, but the first of
-    three and more, for DDS threads. One chain of which too little is to be seen runs on the last.
+    """Return what an earlier recording shows of chains, and each node's core to profile it on.
+
+    Without ``request.cores`` these are the last core, and others as far as they are worth it; of
+    three and more, the first is for DDS threads. A chain of which too little is to be seen runs on
+    the last, and has no profile.
 
     Raises: as :func:`.profile_chains`; PlatformError: no such core.
     """
     available = available_cores()
-    found = (available[1:] if len(available) > 2 else available)[::-1]
-    cores, worth = (found, WORTH) if request.cores is None else (request.cores, 0.0)
+    offered = (available[1:] if len(available) > 2 else available)[::-1]
+    cores, worth = (offered, WORTH) if request.cores is None else (request.cores, 0.0)
     check_cores(dict.fromkeys(cores, "the chain"))
     try:
         seen = profile_chains(recording, chains, period_ns=period_ns)
@@ -157,29 +173,36 @@ def profiled_cores(
             raise
         return (), dict.fromkeys(chain_nodes(recording, *chains), cores[0])
     core_of = cores_for(seen, cores, request, worth)
-    return seen, {node: core_of[node] for one in seen for node in one.core_of}
+    return seen, {node: core_of[node] for profile in seen for node in profile.core_of}
 
 
 def undelayed(seen: Sequence[Profile], core_of: Mapping[str, int]) -> list[list[int]]:
-    """The places of chains, those together that one recording can measure as if alone."""
-    found: list[tuple[list[int], set[int]]] = []
-    for group in beginning_together(seen):
-        cores = {core_of[node] for place in group for node in seen[place].core_of}
-        apart = next((one for one in found if one[1].isdisjoint(cores)), None)
-        if apart is None:
-            found.append(apart := ([], set()))
-        apart[0].extend(group)
-        apart[1].update(cores)
-    return [places for places, _ in found] or [[0]]
+    """Group chains, by their places, that a recording can measure together as if alone."""
+    groups: list[tuple[list[int], set[int]]] = []  # places of chains, and the cores they have
+    for together in beginning_together(seen):
+        cores = {core_of[node] for place in together for node in seen[place].core_of}
+        for places, taken in groups:
+            if taken.isdisjoint(cores):
+                places.extend(together)
+                taken.update(cores)
+                break
+        else:
+            groups.append((list(together), cores))
+    return [places for places, _ in groups] or [[0]]
 
 
 def executors_of(
-    found: Allocation, nodes: frozenset[str], processes: Sequence[RunningProcess]
+    allocation: Allocation, nodes: frozenset[str], processes: Sequence[RunningProcess]
 ) -> list[NodeThread]:
-    """The threads that execute these nodes or publish for them; by default all but launchers'."""
-    running = [one for one in found.threads if one.thread.role in ("executor", "publisher")]
+    """Return the threads that execute these nodes or publish for them.
+
+    Without nodes, they are those of all nodes, but for launchers.
+    """
+    running = [
+        listed for listed in allocation.threads if listed.thread.role in ("executor", "publisher")
+    ]
     if nodes:
-        return [one for one in running if not nodes.isdisjoint(one.nodes)]
-    owners = {one.thread.pid for one in found.threads if one.nodes}
-    launchers = {one.parent for one in processes if one.pid in owners}
-    return [one for one in running if one.nodes and one.thread.pid not in launchers]
+        return [listed for listed in running if not nodes.isdisjoint(listed.nodes)]
+    owners = {listed.thread.pid for listed in allocation.threads if listed.nodes}
+    launchers = {process.parent for process in processes if process.pid in owners}
+    return [listed for listed in running if listed.nodes and listed.thread.pid not in launchers]

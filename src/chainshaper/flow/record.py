@@ -24,7 +24,7 @@ from chainshaper.analysis.objects import resolve_objects
 from chainshaper.enforcement.journal import Governed, governing, in_force_throughout
 from chainshaper.enforcement.node_threads import allocate, strangers_text
 from chainshaper.flow.exploration import with_trace_events
-from chainshaper.flow.threads import recorded_processes
+from chainshaper.flow.recorded_processes import recorded_processes
 from chainshaper.linux import processes as running
 from chainshaper.linux.own_processes import check_command, end_command, end_in_words, start_command
 from chainshaper.linux.processes import RunningProcess, find_applications
@@ -48,8 +48,10 @@ from chainshaper.workload.stall_meter import StallWatch, far_from, stalls_watche
 
 _T = TypeVar("_T")
 Scheduling: TypeAlias = AbstractContextManager[Callable[[Sequence[RunningProcess]], bool]]
-"""Changes how the application's threads run for as long as its context lasts. What it gives is
-called about once a second with the processes, and says whether all is as it shall be from now on.
+"""Changes how the application's threads run, until its context ends.
+
+It yields a function that is called about once a second with the processes, and returns whether the
+scheduling is in force from now on.
 """
 
 TRACE_FOLDER = "trace"
@@ -73,21 +75,22 @@ class _RecordedRun:
     """An application that is recorded, and what was seen of it."""
 
     tracer: Tracer
-    folder: Path
-    words: Sequence[str]  # of the command
+    folder: Path  # of the trace
+    words: Sequence[str]  # of the command; none: it runs already
     duration_ns: int | None
     stop: threading.Event
     progress: Callable[[float, str], None]
-    users: frozenset[int]
-    pids: Sequence[int]
+    users: frozenset[int]  # whose processes are nodes
+    pids: Sequence[int]  # of processes that stand for their descendants too; none: all that run
     gate_logs: Sequence[Path]
     notes: tuple[str, ...] = ()
     command: "subprocess.Popen[bytes] | None" = None
+    # Schedules threads; returns whether the scheduling is in force.
     schedule: Callable[[Sequence[RunningProcess]], bool] | None = None
-    begun_ns: int = 0
-    ended_ns: int = 0
-    processes: tuple[RunningProcess, ...] = ()
-    strangers: str | None = None
+    begun_ns: int = 0  # CLOCK_MONOTONIC
+    ended_ns: int = 0  # the same; 0: it has not ended
+    processes: tuple[RunningProcess, ...] = ()  # at the last look
+    strangers: str | None = None  # a line about other users' processes that may be nodes
     environment: Environment | None = None  # a node's
     endpoints: tuple[EndpointInfo, ...] = ()
     no_qos_because: str | None = "no process was seen that looks like a node"
@@ -134,16 +137,25 @@ def record_command(
     parent = output.absolute().parent
     for left in leftovers(parent, output.name):
         progress(0.0, leftover_text(left))
-    held = ExitStack()
+    until = ExitStack()
     try:
         folder = Path(tempfile.mkdtemp(prefix=f".{output.name}.tracing-", dir=parent))
-        held.enter_context(claimed(folder))
+        until.enter_context(claimed(folder))
     except OSError as error:
         raise OperationError(f"{parent}: no trace can be written there: {error}") from error
     try:
         tracer = _tracer(source, folder, command, pids, buffer, users=taken)
-        how = (command, duration_ns, stop or threading.Event(), progress, taken, pids)
-        run = _RecordedRun(tracer, folder, *how, gate_logs)
+        run = _RecordedRun(
+            tracer=tracer,
+            folder=folder,
+            words=command,
+            duration_ns=duration_ns,
+            stop=stop or threading.Event(),
+            progress=progress,
+            users=taken,
+            pids=pids,
+            gate_logs=gate_logs,
+        )
         try:
             _trace(run, scheduling, command_stdout, stalls=watch_stalls)
             progress(1.0, "reading the events")
@@ -152,20 +164,20 @@ def record_command(
         except BaseException as error:  # the trace may be of hours: nothing costs it
             if not run.ended_ns:
                 raise
-            said = "".join(f"; {note.rstrip('.')}" for note in run.notes)
+            notes = "".join(f"; {note.rstrip('.')}" for note in run.notes)
             if any(folder.iterdir()):
                 left = rename_output(folder, output.with_name(folder.name.lstrip(".")))
-                said += f"; what was traced stays in {left}"
+                notes += f"; what was traced stays in {left}"
             if isinstance(error, ChainshaperError):
-                raise OperationError(f"{error}{said}") from error
-            progress(1.0, f"it cannot be read{said}")
+                raise OperationError(f"{error}{notes}") from error
+            progress(1.0, f"it cannot be read{notes}")
             raise
         if any(folder.iterdir()):
             open_to_all(folder)
             rename_output(folder, recording.path / TRACE_FOLDER)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-        held.close()
+        until.close()
     return Recorded(recording, run.exit_code)
 
 
@@ -178,7 +190,7 @@ def _tracer(
     *,
     users: frozenset[int],
 ) -> Tracer:
-    """Who records."""
+    """Return the tracer that was asked for, or that fits. Raises InputError: there is no such."""
     if source is None:
         # A given buffer, and processes that run already, are LTTng's to answer.
         source = "lttng" if buffer is not None or not command else "preload"
@@ -187,8 +199,9 @@ def _tracer(
     if source not in ("ebpf", "preload"):
         raise InputError(f"{source!r} is no source of events: name lttng, preload or ebpf")
     if buffer is not None:
-        why = f"leave it out with `--source {source}`"
-        raise InputError(f"--buffer is about LTTng's buffers: {why}")
+        raise InputError(
+            f"--buffer is about LTTng's buffers: leave it out with `--source {source}`"
+        )
     if source == "preload":
         return preload.PreloadTracer(folder, command, pids, users)
     return ebpf.EbpfTracer(folder, command, pids, users)
@@ -197,6 +210,7 @@ def _tracer(
 def _trace(
     run: _RecordedRun, scheduling: Scheduling | None, stdout: int | None, *, stalls: bool
 ) -> None:
+    """Trace the application from its start to its end, and look at it meanwhile."""
     with ExitStack() as undo:
         if stalls:
             run.stalls = undo.enter_context(stalls_watched(available_cores(), may_use_fifo()))
@@ -261,19 +275,21 @@ def _watch(run: _RecordedRun) -> None:
 
 
 def _look(run: _RecordedRun) -> None:
-    """Which processes and threads there are, and a node's environment."""
+    """See which processes and threads there are, and a node's environment."""
     if run.pids:
         parent_of = parents()
         family = running.descendants(parent_of, *run.pids) & parent_of.keys()
         run.processes = running.list_processes(family)
     else:
-        found = find_applications(running.list_processes())
-        run.processes = tuple(one for one in found if one.user in run.users)
-        run.strangers = strangers_text(found, run.users) or run.strangers
-    pids = {one.pid for one in run.processes}
+        applications = find_applications(running.list_processes())
+        run.processes = tuple(process for process in applications if process.user in run.users)
+        run.strangers = strangers_text(applications, run.users) or run.strangers
+    pids = {process.pid for process in run.processes}
     run.governed = governing(pids, time.monotonic_ns(), run.governed)
     # The node that was started last, not its launcher, nor what only carries its command line.
-    nodes = sorted(find_applications(run.processes), key=lambda one: (one.participates, one.pid))
+    nodes = sorted(
+        find_applications(run.processes), key=lambda process: (process.participates, process.pid)
+    )
     if nodes:
         try:
             run.environment = environment_of(nodes[-1].pid)
@@ -285,6 +301,10 @@ def _look(run: _RecordedRun) -> None:
 
 
 def _written(output: Path, run: _RecordedRun, chain: str | None, plan: Plan | None) -> Recording:
+    """Write the recording: the events, and all else that is known of the run.
+
+    Raises OperationError: nothing was traced, or the scheduling was never in force.
+    """
     tables, info = run.tracer.recording()
     if run.stalls.table is not None:
         tables = {**tables, "machine_stall": run.stalls.table}
@@ -292,8 +312,8 @@ def _written(output: Path, run: _RecordedRun, chain: str | None, plan: Plan | No
     tables, missing = with_gate_logs(tables, run.gate_logs, since_ns, run.ended_ns)
     run.notes += missing
     if run.command is None:  # its nodes were created before tracing began
-        found = partial(with_found_nodes, tables, info, run.endpoints, run.processes)
-        tables, info = _beside_events(run, "nodes", found, (tables, info))
+        find_nodes = partial(with_found_nodes, tables, info, run.endpoints, run.processes)
+        tables, info = _beside_events(run, "nodes", find_nodes, (tables, info))
     recording = Recording(output, info, tables)
     threads: tuple[ThreadInfo, ...] = ()
     endpoints: tuple[EndpointInfo, ...] = ()
@@ -336,47 +356,54 @@ def _written(output: Path, run: _RecordedRun, chain: str | None, plan: Plan | No
     return recordings.write_recording(output, tables, info)
 
 
-def _beside_events(run: _RecordedRun, what: str, ask: Callable[[], _T], otherwise: _T) -> _T:
-    """What is known of an application beside its events, which are written whatever fails here."""
+def _beside_events(run: _RecordedRun, name: str, ask: Callable[[], _T], otherwise: _T) -> _T:
+    """Return what is known of an application beside its events; ``otherwise``, if that fails.
+
+    The events are written whatever fails here, with a note that names what is not known.
+    """
     try:
         return ask()
     except Exception as error:
         failed = f"{type(error).__name__}: {error}"
-        run.notes += (f"the application's {what} are not known: reading them failed ({failed}).",)
+        run.notes += (f"the application's {name} are not known: reading them failed ({failed}).",)
         return otherwise
 
 
 def _recorded_threads(
     processes: Sequence[RunningProcess], recording: Recording
 ) -> tuple[ThreadInfo, ...]:
-    """The threads of the nodes among ``processes`` (without nodes, of those in DDS), numbered as in
-    the recording. One that works for several nodes (a container's) is given to none.
+    """Return the threads of the nodes among ``processes``, numbered as in the recording.
+
+    Without nodes they are those of processes in DDS. A thread that works for several nodes (a
+    container's) is given to none.
     """
     recorded, _ = recorded_processes(recording)
     pids = {seen.pid for seen in recorded}
-    here = recording.info.pid_namespace == own_pid_namespace()
-    number = {one.pid: one.pid if here else one.inner_pid for one in processes}
-    nodes = [one for one in processes if number[one.pid] in pids]
-    nodes = nodes or [one for one in processes if one.participates]
+    is_here = recording.info.pid_namespace == own_pid_namespace()
+    pid_there = {
+        process.pid: process.pid if is_here else process.inner_pid for process in processes
+    }
+    nodes = [process for process in processes if pid_there[process.pid] in pids]
+    nodes = nodes or [process for process in processes if process.participates]
     return tuple(
         ThreadInfo(
-            tid=found.thread.tid if here else found.thread.inner_tid,
-            pid=number[found.thread.pid],
-            comm=found.thread.comm,
-            node=found.nodes[0] if len(found.nodes) == 1 else "",
-            role=found.thread.role,
-            policy=found.thread.policy,
-            priority=found.thread.priority,
-            cores=found.thread.cores,
+            tid=listed.thread.tid if is_here else listed.thread.inner_tid,
+            pid=pid_there[listed.thread.pid],
+            comm=listed.thread.comm,
+            node=listed.nodes[0] if len(listed.nodes) == 1 else "",
+            role=listed.thread.role,
+            policy=listed.thread.policy,
+            priority=listed.thread.priority,
+            cores=listed.thread.cores,
         )
-        for found in allocate(nodes, recorded, among=processes).threads
+        for listed in allocate(nodes, recorded, among=processes).threads
     )
 
 
 def _known_endpoints(
     tables: events.EventTables, asked: Sequence[EndpointInfo]
 ) -> tuple[EndpointInfo, ...]:
-    """The graph's endpoints with their depths from the trace, in order, then those only it saw."""
+    """Return the graph's endpoints with their depths from the trace, then those only traced."""
     objects = resolve_objects(tables)
     traced: list[EndpointInfo] = []
     by_kind = {"publisher": objects.publishers, "subscription": objects.subscriptions}
@@ -386,12 +413,14 @@ def _known_endpoints(
         )
         rows = owners.join(created, on=["pid", "handle", "valid_from"]).sort("valid_from")
         rows = rows.drop_nulls(["node", "topic"]).select("node", "topic", "depth")
-        traced += [EndpointInfo.model_validate({"kind": kind, **one}) for one in rows.to_dicts()]
-    found = []
-    for one in asked:
-        same = [t for t in traced if (t.node, t.topic, t.kind) == (one.node, one.topic, one.kind)]
-        depth = one.depth or (same[0].depth if same else None)  # 0: not known
-        for other in same[:1]:
-            traced.remove(other)
-        found.append(one.model_copy(update={"depth": depth}))
-    return (*found, *traced)
+        traced += [EndpointInfo.model_validate({"kind": kind, **row}) for row in rows.to_dicts()]
+    known = []
+    for endpoint in asked:
+        key, depth = (endpoint.node, endpoint.topic, endpoint.kind), endpoint.depth or None
+        for place, seen in enumerate(traced):
+            if (seen.node, seen.topic, seen.kind) == key:
+                depth = depth or seen.depth  # 0: the graph does not know it
+                del traced[place]
+                break
+        known.append(endpoint.model_copy(update={"depth": depth}))
+    return (*known, *traced)

@@ -52,8 +52,10 @@ from chainshaper.values.yaml_file import AS_YAML, PlainData, compose, wrong_valu
 from chainshaper.verify.promises import OutputsDue
 from chainshaper.workload.description import Application, application_as_written, origin_timer
 
-Values: TypeAlias = Mapping[str, Any]  # one for every axis: a point
+Values: TypeAlias = Mapping[str, Any]
+"""A point: a value for every axis."""
 Row: TypeAlias = Mapping[str, Any]
+"""What became of a point: :data:`FIGURES` by name."""
 _Model = TypeVar("_Model", bound=BaseModel)
 
 INTERFERENCE = "interference"
@@ -74,8 +76,11 @@ _WISHES = {
 _RANGE = re.compile(r"(-?\d{1,18})\.\.(-?\d{1,18})")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)e[+-]?\d+", re.IGNORECASE)
 _BAND = {
-    **{"start_ns": pl.Int64, "end_ns": pl.Int64},
-    **{"predicted_share": pl.Float64, "share": pl.Float64, "jitter_ns": pl.Int64},
+    "start_ns": pl.Int64,
+    "end_ns": pl.Int64,
+    "predicted_share": pl.Float64,
+    "share": pl.Float64,
+    "jitter_ns": pl.Int64,
 }
 _OF_RUN = ("min_ns", "mean_ns", "max_ns", "jitter_ns", "spread_ns")
 
@@ -92,12 +97,18 @@ FIGURES: dict[str, Any] = {
 }
 """The columns of a row behind those of the axes.
 
-``profile_…`` are L̲, the average and L̄ that the plan rests on, ``predicted_…`` the plan's own
-(eq. 5). All others are of the judged run: ``incomplete`` instances of the chain gave no output,
-``late`` ones behind the last slot (without slots: later than the plan says); ``missed`` are both,
-``most_missed`` so many at most as the plan promises, and ``kept`` says whether it is so
-(:class:`~chainshaper.verify.promises.OutputsDue`); ``band_jitter_ns`` is the widest of those
-``per_band``. ``seconds`` were computed, the profile, which points share, apart.
+    profile_min_ns, profile_mean_ns, profile_max_ns: L̲, the average and L̄ that the plan rests on.
+    predicted_…_ns: what the plan predicts (eq. 5).
+    count, min_ns … p99.99_ns: latencies of the judged run, as are all that follow.
+    incomplete: instances of the chain without an output.
+    late: outputs behind the last slot (without slots: later than the plan says).
+    missed: both.
+    most_missed: so many at most, as the plan promises.
+    kept: whether it is so (:class:`~chainshaper.verify.promises.OutputsDue`).
+    band_jitter_ns: the widest of those ``per_band``.
+    per_band: slot, shares and jitter of each band.
+    error: why the point could not be judged.
+    seconds: of computing, without the profile, which points share.
 """
 
 
@@ -164,10 +175,15 @@ def sweep(
                     add(number, row)
                     progress(len(rows) / len(points), f"{len(points)} points")
         axes = [_axis(name, [values[name] for values in points]) for name in grid.axes]
-        same = {"cycles": grid.cycles, "seed": grid.application.seed}
-        own = [pl.lit(n, pl.Int64).alias(name) for name, n in same.items() if name not in grid.axes]
-        figures = pl.DataFrame([dict(rows[n]) for n in range(len(points))], schema=FIGURES)
-        frame = pl.DataFrame(axes).with_columns(own).hstack(figures)
+        constants = {"cycles": grid.cycles, "seed": grid.application.seed}
+        columns = [
+            pl.lit(value, pl.Int64).alias(name)
+            for name, value in constants.items()
+            if name not in grid.axes
+        ]
+        in_order = [dict(rows[number]) for number in range(len(points))]
+        figures = pl.DataFrame(in_order, schema=FIGURES)
+        frame = pl.DataFrame(axes).with_columns(columns).hstack(figures)
         content = io.BytesIO()
         frame.write_parquet(content)
         write_whole(output, [content.getvalue()])
@@ -176,13 +192,13 @@ def sweep(
 
 
 def _axis(name: str, column: Sequence[Any]) -> pl.Series:
-    """An axis as a column: nanoseconds, numbers, truth values, or else texts as YAML has them."""
+    """Return an axis as a column: times (ns), numbers, truth values, or texts as YAML has them."""
     if is_duration(name, column):
-        times = [parse_duration(v) if isinstance(v, str) else v for v in column]
+        times = [parse_duration(value) if isinstance(value, str) else value for value in column]
         return pl.Series(f"{name}_ns", times, dtype=pl.Int64)
     kinds = {type(value) for value in column if value is not None}
-    for dtype, those in ((pl.Boolean, {bool}), (pl.Int64, {int}), (pl.Float64, {int, float})):
-        if kinds and kinds <= those:
+    for dtype, fitting in ((pl.Boolean, {bool}), (pl.Int64, {int}), (pl.Float64, {int, float})):
+        if kinds and kinds <= fitting:
             return pl.Series(name, column, dtype=dtype)
 
     def text(value: Any) -> str:
@@ -194,7 +210,10 @@ def _axis(name: str, column: Sequence[Any]) -> pl.Series:
 
 
 def parse_axis(text: str) -> tuple[str, tuple[Any, ...]]:
-    """An axis as it is written: ``bands=1..5``, ``epsilon=0,1ms``, ``policy=none,shaped``."""
+    """Return the name and values of an axis: ``bands=1..5``, ``epsilon=0,1ms``, ``policy=none``.
+
+    Raises InputError: it is no axis.
+    """
     name, _, values = text.partition("=")
     try:
         root = compose(f"[{values}]", "value")
@@ -207,11 +226,11 @@ def parse_axis(text: str) -> tuple[str, tuple[Any, ...]]:
             f" bands=1..5 ({error})"
         ) from error
     plain = json.loads(json.dumps(listed))  # lists where YAML's reader has tuples
-    return name.strip(), tuple(value for one in plain for value in _expanded(one))
+    return name.strip(), tuple(value for written in plain for value in _expanded(written))
 
 
 def _expanded(written: Any) -> Iterator[Any]:
-    """A range as its numbers, and numbers that YAML 1.1 takes for texts (1e-6)."""
+    """Yield the numbers of a range, the number that a text such as 1e-6 is, or the value."""
     if isinstance(written, str) and (ends := _RANGE.fullmatch(written)):
         numbers = range(int(ends[1]), int(ends[2]) + 1)
         if numbers[MOST_POINTS:]:
@@ -231,14 +250,14 @@ def grid_of(
     cycles: int,
     seed: int | None = None,
 ) -> Grid:
-    """A grid. Raises InputError: an unknown or empty axis, or a value that it cannot have."""
+    """Return a grid. Raises InputError: an unknown or empty axis, or a value it cannot have."""
     if seed is not None:
         application = application.model_copy(update={"seed": seed})
     if cycles < 1:
         raise InputError(f"{cycles} cycles cannot be simulated: ask for at least 1")
     # Wishes are called as the command line calls them, or as Python does.
     python = {name: name.replace("-", "_").removesuffix("_ns") for name in axes}
-    known = {name: own if own in _WISHES else name for name, own in python.items()}
+    known = {name: wish if wish in _WISHES else name for name, wish in python.items()}
     named = {known[name]: tuple(values) for name, values in axes.items()}
     if len(named) < len(axes):
         raise InputError(f"an axis is given twice, of {', '.join(axes)}: give all values at once")
@@ -259,15 +278,17 @@ def grid_of(
 
 
 def points_of(grid: Grid) -> list[Values]:
-    """All points, in the order of the axes: the last one changes fastest."""
+    """Return all points, in the order of the axes: the last axis changes fastest."""
     return [dict(zip(grid.axes, values, strict=True)) for values in product(*grid.axes.values())]
 
 
 def _changes_application(name: str) -> bool:
+    """Return whether an axis is a value of the application's description."""
     return name not in _WISHES and not name.startswith(PLAN)
 
 
 def _refuse_unknown(name: str, plan: ChainPlan | None) -> None:
+    """Refuse an axis that says nothing. Raises InputError."""
     if plan is not None and name in _WISHES:
         raise InputError(
             f"axis {name} is a wish for a plan, but a plan is given: leave it out, or vary a value"
@@ -276,18 +297,19 @@ def _refuse_unknown(name: str, plan: ChainPlan | None) -> None:
     if plan is None and name.startswith(PLAN):
         raise InputError(f"axis {name} is a value of a plan's file: give the plan, too")
     keys = [field.removesuffix("_ns") for field in Application.model_fields]
-    first, others = name.partition(".")[0], [*_WISHES, INTERFERENCE]
+    first, named = name.partition(".")[0], [*_WISHES, INTERFERENCE]
     if _changes_application(name) and first not in (*keys, INTERFERENCE):
-        near = difflib.get_close_matches(first, [*others, *keys], n=1)
+        near = difflib.get_close_matches(first, [*named, *keys], n=1)
+        meant = f", did you mean {near[0]}?" if near else ""
         raise InputError(
-            f"axis {name}: no such thing{f', did you mean {near[0]}?' if near else ''} There are"
-            f" {', '.join(others)}, plan.PATH with a plan, and values of the description, by paths"
+            f"axis {name}: no such thing{meant} There are"
+            f" {', '.join(named)}, plan.PATH with a plan, and values of the description, by paths"
             f" that begin with {', '.join(keys)}"
         )
 
 
 def is_duration(name: str, values: Sequence[Any]) -> bool:
-    """Whether an axis has durations only: all with units, but for zeros."""
+    """Return whether an axis has durations only: all with units, but for zeros."""
     durations = []
     with suppress(InputError):
         texts = {str(value) for value in values if value not in (0, None)}
@@ -296,7 +318,7 @@ def is_duration(name: str, values: Sequence[Any]) -> bool:
 
 
 def application_at(grid: Grid, values: Values) -> Application:
-    """The application of a point. Raises InputError: it cannot be."""
+    """Return the application of a point. Raises InputError: it cannot be."""
     changes = {name: value for name, value in values.items() if _changes_application(name)}
     if not changes:
         return grid.application
@@ -310,7 +332,10 @@ def application_at(grid: Grid, values: Values) -> Application:
 
 
 def plan_at(grid: Grid, values: Values) -> ChainPlan | None:
-    """The given plan with the point's values in it, if any. Raises InputError: that is no plan."""
+    """Return the given plan, if any, with the point's values in it.
+
+    Raises InputError: that is no plan.
+    """
     changes = {name: value for name, value in values.items() if name.startswith(PLAN)}
     if grid.plan is None or not changes:
         return grid.plan
@@ -319,7 +344,10 @@ def plan_at(grid: Grid, values: Values) -> ChainPlan | None:
 
 
 def request_at(grid: Grid, values: Values) -> PlanRequest | None:
-    """What is wished of a point's plan, if one is made. Raises InputError: no such wish can be."""
+    """Return what is asked for of a point's plan; None: no plan is made for it.
+
+    Raises InputError: that cannot be asked for.
+    """
     if grid.plan is not None or values.get("policy") == UNPLANNED:
         return None
     wishes: dict[str, Any] = {"seed": values.get("seed", grid.application.seed)}
@@ -330,17 +358,22 @@ def request_at(grid: Grid, values: Values) -> PlanRequest | None:
         return _REQUEST.validate_json(json.dumps(wishes), strict=True)
     except ValidationError as error:
         wrong, name = error.errors()[0], str(error.errors()[0]["loc"][0])
-        said = f"axis {name.removesuffix('_ns')}: {wishes.get(name)!r} is no value of it"
-        raise InputError(f"{said}: {wrong['msg']}") from error
+        axis = f"axis {name.removesuffix('_ns')}"
+        raise InputError(
+            f"{axis}: {wishes.get(name)!r} is no value of it: {wrong['msg']}"
+        ) from error
 
 
 def _changed(model: type[_Model], data: Any, changes: Values, without: str = "") -> _Model:
-    """A model's plain data with values replaced by their paths, validated."""
+    """Return a model's plain data with values replaced by their paths, validated.
+
+    Raises InputError: the values do not fit.
+    """
     for name, value in changes.items():
         if name != without:
             data = _replaced(data, name.removeprefix(PLAN).split("."), value)
-    said = ", ".join(f"{name}={value}" for name, value in changes.items())
-    with wrong_values_refused(model, f"{said}: "):
+    assignments = ", ".join(f"{name}={value}" for name, value in changes.items())
+    with wrong_values_refused(model, f"{assignments}: "):
         return model.model_validate_json(json.dumps(data), context=AS_YAML)
 
 
@@ -355,7 +388,7 @@ def _refuse_unknown_node(name: str, described: Mapping[str, Any]) -> None:
 
 
 def _replaced(data: Any, path: list[str], value: Any) -> Any:
-    """Plain data with one value in it replaced; mappings on the way to it are made."""
+    """Return plain data with the value at a path replaced; mappings on the way to it are made."""
     if not path:
         return value
     key, *rest = path
@@ -366,16 +399,17 @@ def _replaced(data: Any, path: list[str], value: Any) -> Any:
 
 
 def _interfered(described: dict[str, Any], period_ns: int, longest_ns: int) -> dict[str, Any]:
-    """The description with the load of section 2.5: once a period, at the lowest priority."""
-    own = described["nodes"].get(INTERFERENCE, {})
-    first, *others = own.get("callbacks", [{"timer": format_duration(period_ns)}])
+    """Return the description with the load of section 2.5 once a period, least urgent of all."""
+    given = described["nodes"].get(INTERFERENCE, {})
+    first, *further = given.get("callbacks", [{"timer": format_duration(period_ns)}])
     times = [format_duration(longest_ns // 2), format_duration(longest_ns)]
-    callbacks = [{**first, "execution": {"uniform": times}}, *others]
-    node = {"priority": 1, "dds_priority": 1, **own, "callbacks": callbacks}
+    callbacks = [{**first, "execution": {"uniform": times}}, *further]
+    node = {"priority": 1, "dds_priority": 1, **given, "callbacks": callbacks}
     return {**described, "nodes": {**described["nodes"], INTERFERENCE: node}}
 
 
 def _nanoseconds(name: str, value: Any) -> Any:
+    """Return a duration of an axis (ns), or what is none: null or 0. Raises InputError."""
     if value is None or value == 0:
         return value
     if not isinstance(value, str):
@@ -384,7 +418,7 @@ def _nanoseconds(name: str, value: Any) -> Any:
 
 
 def profile_at(grid: Grid, values: Values, progress: Progress | None = None) -> Profile | str:
-    """The measurements that a point is planned from, or why there are none."""
+    """Return the measurements that a point is planned from, or why there are none."""
     try:
         application = _urgent(application_at(grid, values))
         most = MOST_RECORDED if values.get("policy") in BY_CALLBACK else STRUCTURE_CYCLES
@@ -409,7 +443,10 @@ def profile_at(grid: Grid, values: Values, progress: Progress | None = None) -> 
 
 
 def _urgent(application: Application) -> Application:
-    """The profiling condition (section 3.1): the chain's executors before all others."""
+    """Return the application in the profiling condition (section 3.1).
+
+    The chain's executors are more urgent than all others.
+    """
     system = build_system(application, follow_chain=True)
     places = [system.entities[callback].process for callback in system.chain.callbacks]
     chain = {system.processes[place].key for place in places}
@@ -427,7 +464,10 @@ def _urgent(application: Application) -> Application:
 def row_at(
     grid: Grid, values: Values, profile: Profile | str | None, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """The :data:`FIGURES` of one point, planned from a ``profile``, if any; or why it cannot be."""
+    """Return the :data:`FIGURES` of a point, which is planned from a ``profile``, if any.
+
+    A profile that is a text says why there is none; this, too, is in the figures.
+    """
     began = time.perf_counter()
     figures: dict[str, Any] = dict.fromkeys(FIGURES)
     try:
@@ -448,14 +488,15 @@ def row_at(
         measured = latency_statistics(complete, incomplete=latencies.size - complete.size)
         figures |= {name: getattr(measured, name) for name in ("count", "incomplete", *_OF_RUN)}
         figures |= {f"p{name}_ns": value for name, value in measured.percentiles_ns.items()}
-        figures |= {} if plan is None else _beside(plan, complete, measured.incomplete)
+        if plan is not None:
+            figures |= _judged(plan, complete, measured.incomplete)
     except ChainshaperError as error:
         figures["error"] = str(error)
     return {**figures, "seconds": round(time.perf_counter() - began, 6)}
 
 
-def _beside(plan: ChainPlan, latencies: Any, incomplete: int) -> dict[str, Any]:
-    """What the plan says, what became of its bands, and whether its promise was kept."""
+def _judged(plan: ChainPlan, latencies: Any, incomplete: int) -> dict[str, Any]:
+    """Return what the plan says, what became of its bands, and whether its promise was kept."""
     slots = slots_of_latency(plan)
     shares: Sequence[float | None] = plan.predicted.shares
     if len(shares) != len(slots):  # slots were edited in number
@@ -465,10 +506,17 @@ def _beside(plan: ChainPlan, latencies: Any, incomplete: int) -> dict[str, Any]:
     bands, jitters = [], []
     for (start, end), before, share in zip(slots, until, shares, strict=True):
         inside = latencies[(latencies >= start) & (latencies < before)]
-        jitters += [int(np.ptp(inside))] if inside.size else []
-        jitter = jitters[-1] if inside.size else None
-        seen = inside.size / latencies.size if latencies.size else None
-        bands.append(dict(zip(_BAND, (start, end, share, seen, jitter), strict=True)))
+        jitter = int(np.ptp(inside)) if inside.size else None
+        if jitter is not None:
+            jitters.append(jitter)
+        band = {
+            "start_ns": start,
+            "end_ns": end,
+            "predicted_share": share,
+            "share": inside.size / latencies.size if latencies.size else None,
+            "jitter_ns": jitter,
+        }
+        bands.append(band)
     latest = slots[-1][1] - 1 if slots else plan.predicted.max_ns
     evidence, predicted = plan.evidence, plan.predicted
     late = int(np.count_nonzero(latencies > latest))
@@ -480,7 +528,9 @@ def _beside(plan: ChainPlan, latencies: Any, incomplete: int) -> dict[str, Any]:
         "predicted_mean_ns": predicted.mean_ns,
         "predicted_max_ns": predicted.max_ns,
         "predicted_jitter_ns": predicted.jitter_ns,
-        **{"late": late, "missed": outputs.missed, "most_missed": outputs.most_missed},
+        "late": late,
+        "missed": outputs.missed,
+        "most_missed": outputs.most_missed,
         "kept": outputs.kept,
         "band_jitter_ns": max(jitters, default=None),
         "per_band": bands,
@@ -488,55 +538,62 @@ def _beside(plan: ChainPlan, latencies: Any, incomplete: int) -> dict[str, Any]:
 
 
 def changing_nothing(frame: pl.DataFrame, axes: Sequence[str]) -> list[str]:
-    """Which axes of a sweep's frame change no figure of the judged run, or some of their values
-    beside some of the others' only; a sentence each.
+    """Return a sentence for each axis that changes no figure of the judged run.
+
+    An axis may change something beside some values of the others only: then the sentence says
+    beside which it does not.
     """
-    figures = ["count", "incomplete", "late", *_OF_RUN, *(n for n in FIGURES if n[:2] == "p9")]
-    said = []
+    percentiles = [name for name in FIGURES if name.startswith("p9")]
+    figures = ["count", "incomplete", "late", *_OF_RUN, *percentiles]
+    sentences = []
     for axis in axes:
-        others = [name for name in axes if name != axis]
-        run = frame.filter(pl.col("error").is_null()).with_columns(all_one=pl.lit(0))
-        groups = run.group_by("all_one", *others, maintain_order=True)
-        found = groups.agg(points=pl.len(), same=pl.struct(figures).n_unique() == 1)
-        found = found.filter(pl.col("points") > 1)
-        same = found.filter("same")
+        further = [name for name in axes if name != axis]
+        run = frame.filter(pl.col("error").is_null()).with_columns(together=pl.lit(0))
+        groups = run.group_by("together", *further, maintain_order=True)
+        compared = groups.agg(points=pl.len(), same=pl.struct(figures).n_unique() == 1)
+        compared = compared.filter(pl.col("points") > 1)
+        same = compared.filter("same")
         if not same.height:
             continue
         name = axis.removesuffix("_ns")
-        where = "" if same.height == found.height else _where(same, others)
+        where = "" if same.height == compared.height else _where(same, further)
         why = ": its load has the lowest priority, or another core" if name == INTERFERENCE else ""
-        said.append(f"{name} changes nothing{where}{why}")
-    return said
+        sentences.append(f"{name} changes nothing{where}{why}")
+    return sentences
 
 
-def _where(same: pl.DataFrame, others: Sequence[str]) -> str:
-    """Beside which values of the other axes: `` where policy is shaped``."""
+def _where(same: pl.DataFrame, axes: Sequence[str]) -> str:
+    """Say at which values of these axes the figures are the same: `` where policy is shaped``."""
     shown = [
-        " and ".join(f"{name.removesuffix('_ns')} is {row[name]}" for name in others)
+        " and ".join(f"{name.removesuffix('_ns')} is {row[name]}" for name in axes)
         for row in same.head(3).to_dicts()
     ]
     more = f" (and {same.height - 3} more)" if same.height > 3 else ""
     return f" where {', or '.join(shown)}{more}"
 
 
-Points: TypeAlias = list[tuple[int, Values]]  # by their numbers
+Points: TypeAlias = list[tuple[int, Values]]
+"""Points, each behind its number."""
 
 
 def groups_of(grid: Grid, points: Iterable[tuple[int, Values]]) -> Iterator[tuple[bool, Points]]:
-    """Points that share a profile, and whether they need one."""
+    """Yield points that share a profile, behind whether they need one."""
     groups = defaultdict[tuple[bool, bool, str], Points](list)
     for number, values in points:
         profiled = request_at(grid, values) is not None
         application = {name: value for name, value in values.items() if _changes_application(name)}
         per_callback = profiled and values.get("policy") in BY_CALLBACK
         groups[profiled, per_callback, json.dumps(application)].append((number, values))
-    return ((profiled, own) for (profiled, *_), own in groups.items())
+    return ((profiled, group) for (profiled, *_), group in groups.items())
 
 
 def rows_of(
     grid: Grid, points: Iterable[tuple[int, Values]], workers: int, scheduler: str | None = None
 ) -> Generator[tuple[int, Row], None, None]:
-    """Rows by their points' numbers, as they are finished; few profiles are in memory at once."""
+    """Yield rows behind their points' numbers, as they are finished.
+
+    Few profiles are in memory at once.
+    """
     groups, pending = list(groups_of(grid, points)), dict[Any, Points | int]()
     bare = (point for profiled, group in groups if not profiled for point in group)
     ready = deque[tuple[int, Values, Any]]((number, values, None) for number, values in bare)
@@ -554,15 +611,15 @@ def rows_of(
             if not pending:
                 return
             future, result = computing.finished()
-            of = pending.pop(future)
-            if isinstance(of, int):
-                yield of, result
-            else:
-                ready.extend((number, values, future) for number, values in of)
+            point = pending.pop(future)
+            if isinstance(point, int):
+                yield point, result
+            else:  # a profile is there for its points
+                ready.extend((number, values, future) for number, values in point)
 
 
 def rows_beside(output: Path) -> Path:
-    """Where the finished rows of a sweep stand until it is whole."""
+    """Return the file in which the finished rows of a sweep stand until it is whole."""
     return output.with_name(output.name + ".rows")
 
 
@@ -570,10 +627,11 @@ def rows_beside(output: Path) -> Path:
 def finished_rows(
     path: Path, about: Mapping[str, Any]
 ) -> Iterator[tuple[dict[int, Row], Callable[[int, Row], None]]]:
-    """The rows that are finished, by the number of their point, and how to add one.
+    """Open the file of finished rows, until the context ends.
 
-    A line of JSON each, behind a first that says what is swept (``about``, plain data). Each is on
-    disk before the next; a crash leaves half a line at most, which is removed.
+    Yields the rows by the number of their point, and a function that adds a row. The file has a
+    line of JSON for each, behind a first that says what is swept (``about``, plain data). Each is
+    on disk before the next; a crash leaves half a line at most, which is removed.
 
     Raises InputError: the file is of another sweep. OperationError: another process works on it, or
     it cannot be read or written.
@@ -613,7 +671,10 @@ def finished_rows(
 
 
 def _read(file: IO[str], path: Path, about: Mapping[str, Any]) -> dict[int, Row]:
-    """The rows of whole lines; what is behind them is cut off."""
+    """Return the rows of whole lines; cut off what is behind them.
+
+    Raises InputError: these are no rows, or those of another sweep.
+    """
     file.seek(0)
     text = file.read()
     whole = text[: text.rfind("\n") + 1]

@@ -1,8 +1,8 @@
 """Control groups of version 2, as far as stopping single threads needs them.
 
 ``cgroup.freeze`` stops every thread in a group on its way back to user space. A **threaded** group
-has some threads of a process, if all groups that share it lie in one *threaded domain*: so it is
-made directly beneath their present one, and keeps every limit.
+may have some threads of a process only, if all groups that share the process are in the same
+*threaded domain*. So it is made directly beneath the threads' present group, whose limits hold on.
 
 Upstream: Documentation/admin-guide/cgroup-v2.rst of the kernel, "Threads" and "Mounting".
 """
@@ -22,19 +22,21 @@ MOUNTS = Path("/proc/mounts")
 QUICK_MOVES = "favordynmods"
 """A mount option since Linux 6.0.
 
-Without it whoever moves a process to another group (a service manager, a container engine) waits
-for a grace period of RCU, 10 to 30 ms, and blocks freezing meanwhile: a slot opens so much later.
+Without it, moving a process to another group, as service managers and container engines do, waits
+for a grace period of RCU, 10 to 30 ms. Freezing waits as well meanwhile, so a slot opens later.
 """
 _BEFORE = "trusted.chainshaper.mount"
-"""Attribute of the hierarchy's root: its mount options before runs of ours. All of these share it,
-and none can lose it: it is in the kernel's memory, as the option is."""
+"""An extended attribute of the hierarchy's root, with its mount options before the first run.
+
+All runs share it. It is in the kernel's memory, so it lasts as long as the mount option.
+"""
 _REMOUNT = 32
 _MOUNT_FLAGS = {"rw": 0, "ro": 1, "nosuid": 2, "nodev": 4, "noexec": 8}
 _MOUNT_FLAGS |= {"noatime": 1 << 10, "nodiratime": 1 << 11, "relatime": 1 << 21}
-"""Of mount(2); an option that is none of them is the file system's own."""
+"""Flags of mount(2), by option; all other options are the file system's."""
 _OCTAL = re.compile(rb"\\([0-3][0-7]{2})")
-"""Blanks, line feeds, backslashes and number signs in names of mount points."""
-_ATTEMPTS = 3
+"""How blanks, line feeds, backslashes and number signs are written in names of mount points."""
+_ATTEMPTS = 3  # at entering a group that another process may be removing
 _THREADED_CONTROLLERS = {"cpu", "cpuset", "perf_event", "pids"}
 _REMEDY = (
     "run as root, or start the application in a group that is yours "
@@ -43,17 +45,17 @@ _REMEDY = (
 
 
 def mount_point() -> Path:
-    """Where the version 2 hierarchy is mounted. Raises PlatformError: it is not."""
+    """Return where the version 2 hierarchy is mounted. Raises PlatformError: it is not."""
     return _mount()[0]
 
 
 def mount_options() -> str:
-    """The options of that mount. Raises PlatformError: there is none."""
+    """Return its mount options. Raises PlatformError: it is not mounted."""
     return _mount()[1]
 
 
 def _mount() -> tuple[Path, str]:
-    # Beside version 1 hierarchies it usually stands at /sys/fs/cgroup/unified.
+    """Return mount point and options; beside version 1 it is usually /sys/fs/cgroup/unified."""
     for line in filter(None, lines_of(read_proc(MOUNTS))):
         _, folder, kind, options, *_ = line.split(b" ")
         if kind == b"cgroup2":
@@ -71,26 +73,31 @@ def moves_are_quick() -> bool:
 
 
 def remount(options: str) -> None:
-    """Have the hierarchy mounted with these options, if the kernel knows and permits them."""
+    """Mount the hierarchy with these options, if the kernel knows and permits them."""
     names = options.split(",")
     flags = _REMOUNT | sum(_MOUNT_FLAGS.get(name, 0) for name in names)
-    own = ",".join(name for name in names if name not in _MOUNT_FLAGS)
-    folder = os.fsencode(mount_point())
-    ctypes.CDLL(None).mount(b"none", folder, b"cgroup2", ctypes.c_ulong(flags), os.fsencode(own))
+    of_file_system = ",".join(name for name in names if name not in _MOUNT_FLAGS)
+    ctypes.CDLL(None).mount(
+        b"none",
+        os.fsencode(mount_point()),
+        b"cgroup2",
+        ctypes.c_ulong(flags),
+        os.fsencode(of_file_system),
+    )
 
 
 def make_moves_quick() -> None:
-    """Have the hierarchy mounted with :data:`QUICK_MOVES` besides what it has."""
+    """Add :data:`QUICK_MOVES` to the hierarchy's mount options."""
     if not moves_are_quick():
         before = mount_options()
-        with contextlib.suppress(OSError):  # without the privilege there is no remounting either
+        with contextlib.suppress(OSError):  # who may not write the attribute may not remount either
             os.setxattr(mount_point(), _BEFORE, os.fsencode(before))
             remount(f"{before},{QUICK_MOVES}")
 
 
 def restore_mount() -> None:
-    """Undo :func:`make_moves_quick`, where a run of ours did it; harmless when repeated."""
-    with contextlib.suppress(OSError):  # none did
+    """Undo :func:`make_moves_quick`, if a run has called it; harmless when repeated."""
+    with contextlib.suppress(OSError):  # there is no attribute: no run has
         before = os.fsdecode(os.getxattr(mount_point(), _BEFORE))
         if moves_are_quick():
             remount(before)
@@ -98,7 +105,10 @@ def restore_mount() -> None:
 
 
 def cgroup_of(tid: int) -> Path:
-    """The folder of a thread's group. Raises OperationError: no thread. PlatformError: hidden."""
+    """Return the folder of a thread's group.
+
+    Raises OperationError: there is no such thread. PlatformError: the group is not visible here.
+    """
     try:
         lines = lines_of(read_proc(f"/proc/{tid}/cgroup"))
     except OSError:
@@ -116,8 +126,9 @@ def cgroup_of(tid: int) -> Path:
 
 
 def make_threaded_child(parent: Path, name: str) -> Path:
-    """Make an empty threaded group directly beneath the group of the threads it is for. Raises
-    OperationError: the name is taken. PlatformError: machine or privileges do not allow it.
+    """Make an empty threaded group directly beneath the group of the threads it is for.
+
+    Raises OperationError: the name is taken. PlatformError: machine or privileges do not allow it.
     """
     folder = parent / name
     try:
@@ -140,19 +151,24 @@ def make_threaded_child(parent: Path, name: str) -> Path:
 
 
 def _obstacle(parent: Path) -> str | None:
-    """What stands in the way of threaded groups: the kernel only says EOPNOTSUPP."""
+    """Say why a group can have no threaded children, for which the kernel only says EOPNOTSUPP."""
+    obstacles = []
     controllers = set(_read(parent / "cgroup.subtree_control").split()) - _THREADED_CONTROLLERS
-    found = [f"it hands the controllers {', '.join(sorted(controllers))} down"] * bool(controllers)
+    if controllers:
+        obstacles.append(f"it hands the controllers {', '.join(sorted(controllers))} down")
     for child in sorted(parent.iterdir()):
         kind = _read(child / "cgroup.type").strip()
         if kind == "domain" and "populated 1" in _read(child / "cgroup.events"):
-            found.append(f"its child {child.name} holds processes of its own")
+            obstacles.append(f"its child {child.name} holds processes of its own")
     remedy = "run the application in a group of its own (a scope or unit)"
-    return f": {found[0]}; {remedy}" if found else None
+    return f": {obstacles[0]}; {remedy}" if obstacles else None
 
 
 def move_thread(tid: int, folder: Path) -> bool:
-    """Put a thread into a group; False when it has ended. Raises PlatformError, OperationError."""
+    """Put a thread into a group; return False if it has ended.
+
+    Raises PlatformError: we may not. OperationError: the kernel refuses for another reason.
+    """
     try:
         (folder / "cgroup.threads").write_text(str(tid))
     except ProcessLookupError:
@@ -166,26 +182,29 @@ def move_thread(tid: int, folder: Path) -> bool:
 
 
 def threads_in(folder: Path) -> tuple[int, ...]:
-    """The living threads of a group that can be seen from our process namespace."""
+    """Return the living threads of a group, without those that our pid namespace does not show."""
     return tuple(int(tid) for tid in _read(folder / "cgroup.threads").split() if tid != "0")
 
 
 def has_unseen_threads(folder: Path) -> bool:
-    """Whether there are others."""
+    """Whether a group has threads that our pid namespace does not show (the kernel writes 0)."""
     return "0" in _read(folder / "cgroup.threads").split()
 
 
 def dissolve(folder: Path, within_s: float = 1.0) -> str | None:
-    """Have a group's threads run in its parent, and remove it; what is left is said, not raised."""
+    """Move a group's threads to its parent, where they run, and remove it.
+
+    Returns what is left, in words; None: nothing. This raises no exception.
+    """
     with contextlib.suppress(OSError):
         (folder / "cgroup.freeze").write_text("0")
     deadline = time.monotonic() + within_s
     reason = ""
     while folder.is_dir():
-        # Again: children are born meanwhile, and a dying process holds its group a little longer.
+        # Again and again: threads start meanwhile, and a process that ends keeps its group a while.
         for tid in threads_in(folder):
             try:
-                # Moving to a group that is not frozen thaws, whatever became of cgroup.freeze.
+                # In a group that is not frozen a thread runs, even if thawing has failed.
                 move_thread(tid, folder.parent)
             except (OperationError, PlatformError) as error:
                 reason = str(error)
@@ -202,18 +221,20 @@ def dissolve(folder: Path, within_s: float = 1.0) -> str | None:
 
 
 def enter_own_group(name: str) -> None:
-    """Put this process into a group of that name, out of reach of what befalls its present one, if
-    it need not stay there, as in a container.
+    """Move this process to a group of that name, so that ending its present group spares it.
+
+    It stays where it is if it may not leave, as in a container.
     """
-    for folder in (folder for folder in _own_groups(name) for _ in range(_ATTEMPTS)):
-        with contextlib.suppress(OSError):  # the last to leave may just be removing it
-            folder.mkdir(exist_ok=True)
-            (folder / "cgroup.procs").write_text(str(os.getpid()))
-            return
+    for folder in _own_groups(name):
+        for _ in range(_ATTEMPTS):
+            with contextlib.suppress(OSError):  # a process that leaves it may be removing it
+                folder.mkdir(exist_ok=True)
+                (folder / "cgroup.procs").write_text(str(os.getpid()))
+                return
 
 
 def leave_own_group(name: str) -> None:
-    """Go back to the group above, and remove ours if it is empty then."""
+    """Move this process to the group above, and remove the group of that name if it is empty."""
     with contextlib.suppress(OSError, OperationError, PlatformError):
         folder = cgroup_of(os.getpid())
         if folder.name == name:
@@ -229,23 +250,26 @@ def remove_own_group(name: str) -> None:
 
 
 def _own_groups(name: str) -> list[Path]:
-    """Where a group of ours may be, the best first: above our present one, and not beneath one with
-    processes, which could have no threaded children then.
+    """Return where a group of that name for this process may be, the best place first.
+
+    It is above the present group, and its parent has no processes, since that could have no
+    threaded children then.
     """
     try:
-        root, own = mount_point(), cgroup_of(os.getpid())
+        root, present = mount_point(), cgroup_of(os.getpid())
     except (OperationError, PlatformError):
         return []
-    above = [folder for folder in (own, *own.parents) if folder.is_relative_to(root)]
+    above = [folder for folder in (present, *present.parents) if folder.is_relative_to(root)]
     return [
         folder / name
         for folder in reversed(above)
-        if not (folder / "cgroup.type").exists()  # the machine's own root, where all is allowed
-        or (folder != own and not _read(folder / "cgroup.procs").strip())
+        if not (folder / "cgroup.type").exists()  # the machine's root, where all is allowed
+        or (folder != present and not _read(folder / "cgroup.procs").strip())
     ]
 
 
 def _read(path: Path) -> str:
+    """Read a file of a group; empty: there is none."""
     try:
         return text_of(read_proc(path))
     except OSError:  # gone, or a file that this kind of group does not have

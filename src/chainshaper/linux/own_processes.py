@@ -1,14 +1,16 @@
-"""Processes that we start, ours and the user's: how they start, how they end.
+"""Start and end processes: our own ones, and the user's command.
 
-A process of ours often has more rights than whoever fills the folder that it is started in. So its
-Python is isolated (``-I``), and gets back our package, and behind all other folders those of the
-libraries that it needs, if root and we alone can change them.
+**Our own** processes often have more rights than the users who can write into the folder in which
+they are started. So their Python is isolated (``-I``). It gets our package and, behind all other
+folders, those of the libraries that it needs, if nobody but root and we can change them.
 
-All have sessions of their own: Ctrl-C reaches us alone. The user's command, such as `ros2 launch
-…`, is asked to end by a SIGINT that reaches each of its processes once: a node that gets a second
-one while it shuts down is killed by it. A command in a terminal expects that the terminal signals
-the whole process group; any other hands the signal on by itself. What does not end gets SIGINT,
-SIGTERM and then SIGKILL, the whole group at once.
+**The user's command**, such as `ros2 launch …`, is asked to end by SIGINT. Each of its processes
+must get that once, since a second one kills a node that is shutting down. A command in a terminal
+expects that the terminal signals its whole process group; any other command passes the signal on
+to its processes by itself. Then whatever has not ended gets SIGINT, SIGTERM and at last SIGKILL,
+the whole group at once.
+
+All processes have sessions of their own, so that Ctrl-C reaches us only.
 """
 
 import contextlib
@@ -31,14 +33,17 @@ from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.files import why_distrusted
 
 LIBRARIES = ("cyclonedds", "numpy", "polars", "pydantic", "yaml")
-"""What processes import that simulate, or have DDS; all others need Python alone."""
+"""What processes import that simulate, or have DDS; all others need the standard library only."""
 
 PATIENCE_S = 15.0
-"""`ros2 launch` itself gives its nodes 5 s after SIGINT, and 5 s after SIGTERM."""
+"""How long a command may take to end after a signal.
 
-_ORPHANS_S = 1.0  # what a command that has ended leaves behind may be about to end as well
+`ros2 launch` itself gives its nodes 5 s after SIGINT, and 5 s after SIGTERM.
+"""
 
-_LOOK_S = 0.05
+_ORPHANS_S = 1.0  # how long the processes of a command may take to end when it has
+
+_LOOK_S = 0.05  # between two looks whether a command has ended
 _PACKAGE = Path(__file__).resolve().parents[1]
 _START = (
     "import importlib.util as u, runpy, sys; package, folders, module = sys.argv[1:4]; "
@@ -51,24 +56,26 @@ _START = (
 
 
 def module_command(module: str, libraries: Sequence[str] = ()) -> list[str]:
-    """How a module runs as a process of ours, with ``libraries`` found where this process does.
-    Raises OperationError: others may change the package, and an isolated Python has no other.
+    """Return the command that runs a module as a process of our own.
+
+    It finds the ``libraries`` where this process does. Raises OperationError: others may change our
+    package, and an isolated Python finds no other.
     """
-    own = (*site.getsitepackages(), str(Path(os.__file__).parent))  # where it looks anyway
+    searched = (*site.getsitepackages(), str(Path(os.__file__).parent))  # by an isolated Python
     package, reason = str(_PACKAGE / "__init__.py"), why_distrusted(_PACKAGE)
     if reason is not None:
-        if not package.startswith(own):
+        if not package.startswith(searched):
             raise OperationError(
                 f"chainshaper's own processes do not run from {_PACKAGE.parent}: {reason}; see "
                 "that only root and you can write there, or install chainshaper elsewhere"
             )
-        package = ""  # whoever installed this Python has it find the package, and answers for that
+        package = ""  # this Python finds it anyway, as whoever installed it has decided
     folders = []
-    for found in map(importlib.util.find_spec, libraries):
-        if found is not None and found.origin is not None:
-            place = Path(found.origin).parents[1 if found.submodule_search_locations else 0]
-            if not str(place).startswith(own) and why_distrusted(place) is None:
-                folders.append(str(place))
+    for spec in map(importlib.util.find_spec, libraries):
+        if spec is not None and spec.origin is not None:
+            folder = Path(spec.origin).parents[1 if spec.submodule_search_locations else 0]
+            if not str(folder).startswith(searched) and why_distrusted(folder) is None:
+                folders.append(str(folder))
     return [sys.executable, "-I", "-c", _START, package, ":".join(dict.fromkeys(folders)), module]
 
 
@@ -80,9 +87,9 @@ def start_module(
     stderr: int = subprocess.PIPE,
     pass_fds: Collection[int] = (),
 ) -> "subprocess.Popen[bytes]":
-    """Start a module as a process of ours; we read its output and errors by default.
+    """Start a module as a process of our own, by default with pipes from its output and errors.
 
-    ``stdin``, ``stdout`` and ``stderr`` are as for Popen; it gets the descriptors ``pass_fds`` too.
+    ``stdin``, ``stdout``, ``stderr`` and ``pass_fds`` are as for Popen.
     """
     return subprocess.Popen(
         [*module_command(module), *arguments],
@@ -95,12 +102,12 @@ def start_module(
 
 
 def named_folders() -> list[str]:
-    """The folders that PYTHONPATH names, but for those that mean the current one."""
+    """Return the folders in PYTHONPATH, without those that depend on the current folder."""
     return [*filter(os.path.isabs, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
 
 
 def tool_environment() -> dict[str, str]:
-    """Our environment, for tools that we run: their programs are in no current folder."""
+    """Return our environment for tools that we run; its PATH has no relative folder."""
     folders = filter(os.path.isabs, os.environ.get("PATH", "").split(os.pathsep))
     return {**os.environ, "PATH": os.pathsep.join(folders) or os.defpath}
 
@@ -121,9 +128,10 @@ def check_command(command: Sequence[str]) -> None:
 def start_command(
     command: Sequence[str], environment: Mapping[str, str] | None = None, stdout: int | None = None
 ) -> subprocess.Popen[bytes]:
-    """Start the command with ``environment`` added to ours, printing to the descriptor ``stdout``;
-    should we be killed, it gets a SIGINT. Raises InputError: as :func:`check_command`.
-    OperationError: the kernel refuses to run it.
+    """Start the user's command; it gets a SIGINT if this process is killed.
+
+    ``environment`` is added to ours; it prints to the descriptor ``stdout``. Raises InputError: as
+    :func:`check_command`. OperationError: the kernel refuses to run it.
     """
     check_command(command)
     try:
@@ -139,16 +147,17 @@ def start_command(
 
 
 def _as_from_a_terminal(parent: int) -> None:
-    # A background job of a script ignores SIGINT, and whatever it starts inherits that.
+    """Make a new process react to signals as one that was started from a terminal."""
+    # A background job of a script ignores SIGINT, and what it starts inherits that.
     for number in (signal.SIGINT, signal.SIGQUIT):
         signal.signal(number, signal.SIG_DFL)
     signalled_with_parent(parent, signal.SIGINT)
 
 
 def end_command(started: subprocess.Popen[bytes], patience_s: float = PATIENCE_S) -> None:
-    """End the command and its process group; ``patience_s`` is waited between the signals.
+    """End the user's command and its process group; ``patience_s`` is waited after each signal.
 
-    The first SIGINT goes where the command expects it (see above); all later ones to the group.
+    The first SIGINT goes where the command expects it (see above), all later signals to the group.
     """
     if started.poll() is None and not _relies_on_terminal(started):
         for pidfd in _asked_first(started):
@@ -164,16 +173,19 @@ def end_command(started: subprocess.Popen[bytes], patience_s: float = PATIENCE_S
 
 
 def _relies_on_terminal(started: subprocess.Popen[bytes]) -> bool:
-    """Whether the command leaves it to its terminal to signal the processes that it has started, as
-    `ros2 launch` does where its input is one, unless it is told that it has none.
+    """Whether the command relies on a terminal to signal the processes that it has started.
+
+    `ros2 launch` does so where its input is a terminal, unless an option says that it has none.
     """
     words = started.args if isinstance(started.args, Sequence) else ()
     return os.isatty(0) and not {"--noninteractive", "-n"}.intersection(map(str, words))
 
 
 def _asked_first(started: subprocess.Popen[bytes]) -> list[int]:
-    """The command as a pidfd. Where it does nothing but wait for another process, as a shell
-    script does, that one too, and so on: who waits hands no signal on.
+    """Return pidfds of the processes that get the first SIGINT: the command, and what it waits for.
+
+    A process that does nothing but wait for another one, as a shell script does, passes no signal
+    on. So the process that it waits for gets one, too, and so on.
     """
     pidfds, pid = list[int](), started.pid
     pidfd: int | None = os.pidfd_open(pid)
@@ -187,8 +199,9 @@ def _asked_first(started: subprocess.Popen[bytes]) -> list[int]:
 
 
 def _waited_for(pid: int, group: int) -> tuple[int, int] | None:
-    """The id and start of the only child of a process that is blocked until a child ends, None
-    where it is not.
+    """Return the child for which a process waits, by id and start; None: it does not wait so.
+
+    It waits if it is blocked until a child ends, and has a single child in the group.
     """
     try:
         if read_proc(f"/proc/{pid}/wchan") != b"do_wait":
@@ -204,8 +217,9 @@ def _waited_for(pid: int, group: int) -> tuple[int, int] | None:
 def _await_end(
     started: subprocess.Popen[bytes], patience_s: float, orphans_s: float | None = None
 ) -> None:
-    """Wait until the command and its group have ended, or for ``patience_s``; where the command
-    has ended, for ``orphans_s`` only, if that is given.
+    """Wait until the command and its group have ended, or for ``patience_s``.
+
+    ``orphans_s``: how long to wait at most when the command has ended, and its group has not.
     """
     deadline = time.monotonic() + patience_s
     while not _over(started) and time.monotonic() < deadline:
@@ -216,16 +230,17 @@ def _await_end(
 
 def _signal_group(started: subprocess.Popen[bytes], number: int) -> None:
     """Signal the command's process group, and no other that has its number by now."""
-    if started.returncode is None:  # it has not been waited for: the number is its own
+    if started.returncode is None:  # not waited for yet, so the number is still the command's
         with contextlib.suppress(ProcessLookupError):
             os.killpg(started.pid, number)
         return
     stats = dict(all_stats())
-    if started.pid in stats:  # another's, so nothing is left of the group
+    if started.pid in stats:  # another process has the number, so nothing is left of the group
         return
-    for pid, (_, _, group, session, *others) in stats.items():
-        if int(group) == int(session) == started.pid:
-            pidfd = open_process(pid, int(others[15]))
+    for pid, fields in stats.items():
+        group, session, started_at = int(fields[2]), int(fields[3]), int(fields[19])
+        if group == session == started.pid:
+            pidfd = open_process(pid, started_at)
             if pidfd is not None:
                 with contextlib.suppress(OSError):  # it has ended, or is another user's
                     signal.pidfd_send_signal(pidfd, number)
@@ -233,19 +248,19 @@ def _signal_group(started: subprocess.Popen[bytes], number: int) -> None:
 
 
 def _over(started: subprocess.Popen[bytes]) -> bool:
-    """Whether it has ended, and no process of its group runs any more (zombies do not)."""
+    """Whether the command has ended, and no process of its group runs (zombies do not)."""
     return started.poll() is not None and not any(_running_in(started.pid))
 
 
 def _running_in(group: int) -> Iterator[tuple[int, list[bytes]]]:
-    """The processes of a group with their fields of /proc/PID/stat, but zombies."""
+    """Yield the processes of a group, without zombies, with the fields of :func:`.all_stats`."""
     for pid, fields in all_stats():
         if fields[0] not in (b"Z", b"X") and int(fields[2]) == group:
             yield pid, fields
 
 
 def end_in_words(code: int) -> str:
-    """A return code of `subprocess`: ``ended with code 3``, ``was killed by SIGSEGV``."""
+    """Say what a return code of `subprocess` means: ``ended with code 3``, ``was killed by …``."""
     if code >= 0:
         return f"ended with code {code}"
     with contextlib.suppress(ValueError):
@@ -254,7 +269,7 @@ def end_in_words(code: int) -> str:
 
 
 def what_happened(process: "subprocess.Popen[Any]") -> str | None:
-    """Why a child of ours is not at work any more, None while it is."""
+    """Say why a child process does not work any more; None: it does."""
     options = os.WEXITED | os.WSTOPPED | os.WNOHANG | os.WNOWAIT
     try:
         state = os.waitid(os.P_PID, process.pid, options)

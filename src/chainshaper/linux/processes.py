@@ -1,12 +1,12 @@
-"""Processes that may belong to a ROS 2 or DDS application, whose they are, and their nodes' names.
+"""Processes that may belong to a ROS 2 or DDS application: their users, and their nodes' names.
 
-A process takes part in DDS when it has a thread that receives or one for timed events, by the names
-of a DDS implementation, or, where those name none (Fast DDS before 2.13), a mapped library and
-further threads.
+**DDS.** A process takes part in DDS if a thread has the name of a thread that receives, or that
+handles timed events, in a DDS implementation. Where threads have no names (Fast DDS before 2.13),
+it does if it has mapped the library and has further threads.
 
-A process is a user's when that user both runs it, by all four of its user ids, and has started its
-program: set-user-ID programs, such as `sudo`, carry the command line and the environment of another
-user than the one they run as. Root may start programs for all.
+**Users.** A process is a user's if that user both runs it, by all four of its user ids, and has
+started its program. A set-user-ID program, such as `sudo`, has the command line and environment of
+another user than the one it runs as. Root may start programs for every user.
 
 Upstream: proc(5), credentials(7), getauxval(3); rcl, `arguments.c` and `remap.c`.
 """
@@ -53,8 +53,10 @@ _WITH_VALUE |= {"--log-level", "--log-config-file", "--log-file-name"}
 
 
 def run_users(named: Collection[str | int] = ()) -> frozenset[int]:
-    """The ids of users, by names or numbers; by default who has launched us, also by `sudo`, and
-    root. Raises InputError: no such user.
+    """Return the ids of users that are named, by name or number.
+
+    By default they are root and the user that has started us, also by `sudo`. Raises InputError:
+    there is no such user.
     """
     users = set()
     for name in map(str, named):
@@ -70,6 +72,7 @@ def run_users(named: Collection[str | int] = ()) -> frozenset[int]:
 
 
 def user_name(user: int | None) -> str:
+    """Return a user's name, or the id of one without; None: the process is of several users."""
     if user is None:
         return "several users"
     with suppress(KeyError):
@@ -79,7 +82,10 @@ def user_name(user: int | None) -> str:
 
 @contextmanager
 def process_folder(pid: int) -> Iterator[int]:
-    """A process's folder in /proc, open: never another process's. Raises OSError: it has ended."""
+    """Open a process's folder in /proc, which never becomes another process's.
+
+    Raises OSError: the process has ended.
+    """
     folder = os.open(f"/proc/{pid}", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         yield folder
@@ -88,24 +94,25 @@ def process_folder(pid: int) -> Iterator[int]:
 
 
 def user_of(pid: int) -> int | None:
-    """The user whose process this is; None if it is no single user's, or gone."""
+    """Return the user of a process; None: it is of no single user, or has ended."""
     with suppress(OSError), process_folder(pid) as folder:
         return user_in(folder)
     return None
 
 
 def user_in(folder: int) -> int | None:
-    """The same from a process's open folder. Raises OSError: the process has ended."""
-    user, *others = status_field(read_proc("status", folder), "Uid")
-    if any(other != user for other in others):
+    """Return the user of a process, given its open folder. Raises OSError: it has ended."""
+    ids = status_field(read_proc("status", folder), "Uid")  # real, effective, saved, file system
+    user = ids[0]
+    if ids.count(user) != len(ids):
         return None
     auxiliary = b""
-    with suppress(OSError):  # it may not be looked at
+    with suppress(OSError):  # reading it is not permitted
         auxiliary = read_proc("auxv", folder)
     entries = _AUXILIARY.iter_unpack(auxiliary[: len(auxiliary) & -_AUXILIARY.size])
-    # The real user when it began its program: who chose command line and environment.
+    # The real user when the program was started, who chose command line and environment.
     started_by = next((value for kind, value in entries if kind == _AT_UID), None)
-    if started_by is None:  # what is root's by its ids may be a set-user-ID program
+    if started_by is None:  # a process with root's ids may be a set-user-ID program
         return None if user == 0 and os.geteuid() == 0 else user
     starters = {started_by}
     for line in lines_of(read_proc("uid_map", folder)):  # of its user namespace
@@ -117,27 +124,25 @@ def user_in(folder: int) -> int | None:
 
 @dataclass(frozen=True)
 class RunningProcess:
-    """A process at one instant; ``inner_pid`` is its id in its own pid namespace, ``user`` None if
-    it is no single user's. Whether it ``participates`` in DDS.
-    """
+    """A process as the kernel shows it at an instant."""
 
     pid: int
-    parent: int
-    command: tuple[str, ...]
-    inner_pid: int
-    participates: bool
+    parent: int  # the id of its parent
+    command: tuple[str, ...]  # its command line
+    inner_pid: int  # its id in its own pid namespace
+    participates: bool  # in DDS
     threads: tuple[RunningThread, ...]
-    user: int | None = None
+    user: int | None = None  # None: it is of no single user
 
 
 def list_processes(pids: Iterable[int] | None = None) -> tuple[RunningProcess, ...]:
-    """Processes with a command line (kernel threads have none), by id; all if none are given."""
-    found = (read_process(pid) for pid in sorted(parents() if pids is None else pids))
-    return tuple(process for process in found if process is not None)
+    """Return processes with a command line, which kernel threads lack, by id (None: all)."""
+    read = (read_process(pid) for pid in sorted(parents() if pids is None else pids))
+    return tuple(process for process in read if process is not None)
 
 
 def read_process(pid: int) -> RunningProcess | None:
-    """A process, None when it is gone, dead, or the kernel's own."""
+    """Read a process; None: it has ended, is a zombie, or belongs to the kernel."""
     try:
         with process_folder(pid) as folder:
             user = user_in(folder)
@@ -146,7 +151,7 @@ def read_process(pid: int) -> RunningProcess | None:
                 return None
             status = read_proc("status", folder)
             participates, threads = _participation(pid, list_threads(pid))
-            # It is the same process still, and the same user's: its id is no other's by now.
+            # If the user is still the same, all of this was read of the same process.
             if not threads or user_in(folder) != user:
                 return None
     except OSError:
@@ -163,27 +168,32 @@ def read_process(pid: int) -> RunningProcess | None:
 
 
 def descendants(parent_of: Mapping[int, int], *pids: int) -> frozenset[int]:
-    """Processes and all their children, theirs and so on; ``parent_of`` maps each to its parent."""
-    family, born = set(pids), set(pids)
-    while born:
-        born = {child for child, parent in parent_of.items() if parent in born} - family
-        family |= born
+    """Return processes with their children, grandchildren and so on, given each one's parent."""
+    family, generation = set(pids), set(pids)
+    while generation:
+        children = {child for child, parent in parent_of.items() if parent in generation}
+        generation = children - family
+        family |= generation
     return frozenset(family)
 
 
 def find_applications(processes: Iterable[RunningProcess]) -> tuple[RunningProcess, ...]:
-    """Those that look like applications of ROS 2 or DDS."""
-    return tuple(one for one in processes if one.participates or takes_ros_arguments(one.command))
+    """Return the processes that look like applications of ROS 2 or DDS."""
+    return tuple(
+        process
+        for process in processes
+        if process.participates or takes_ros_arguments(process.command)
+    )
 
 
 def _participation(
     pid: int, threads: tuple[RunningThread, ...]
 ) -> tuple[bool, tuple[RunningThread, ...]]:
-    """Whether a process takes part in DDS, and its threads with what they do there."""
+    """Return whether a process takes part in DDS, and its threads with what they do there."""
     if any(thread.kind in ("receive", "event") for thread in threads):
         return True, threads
     if len(threads) > 1:
-        with suppress(OSError):  # another user's: its threads' names are all there is to see
+        with suppress(OSError):  # of another user's process only the threads' names can be seen
             mapped = read_proc(f"/proc/{pid}/maps")
             for middleware in MIDDLEWARES:
                 waited_in = middleware.receivers_wait_in
@@ -201,89 +211,90 @@ def _participation(
 
 
 class Region(NamedTuple):
-    """An area of a process's memory, ``offset`` bytes into the file ``path``, or with no file, or
-    the kernel's name for it (``[stack]``).
-    """
+    """An area of a process's memory."""
 
-    start: int
-    end: int
-    offset: int
+    start: int  # address
+    end: int  # the address behind it
+    offset: int  # bytes from the beginning of the file
     executable: bool
-    path: str
+    path: str  # of the file, the kernel's name of the area (``[stack]``), or empty
 
 
 def regions_in(maps: bytes) -> Iterator[Region]:
-    """The regions in the content of a file /proc/PID/maps, by address."""
+    """Yield the regions in the content of a file /proc/PID/maps, by address."""
     for line in filter(None, lines_of(maps)):
         span, rights, offset, _, _, *path = line.split(maxsplit=5)
         start, end = (int(bound, 16) for bound in span.split(b"-"))
-        name = os.fsdecode(path[0]) if path else ""  # it may be opened
+        name = os.fsdecode(path[0]) if path else ""  # exactly, so that it can be opened
         yield Region(start, end, int(offset, 16), b"x" in rights, name)
 
 
 def region_at(regions: Sequence[Region], address: int) -> Region | None:
-    """The region, of those of a process by address, that has this one."""
-    number = bisect(regions, address, key=lambda one: one.start) - 1
+    """Return the region with an address; None: none has it. The regions are sorted by address."""
+    number = bisect(regions, address, key=lambda region: region.start) - 1
     return regions[number] if number >= 0 and address < regions[number].end else None
 
 
 _SYSCALLS = {"x86_64": ((45, 47), 202), "aarch64": ((207, 212), 98)}  # recvfrom, recvmsg; futex
 _OF_LANGUAGE = re.compile(r"/(lib(c|pthread|stdc\+\+|gcc_s)|ld-linux[-\w]*)[-.]|\[vdso\]")
-_OUTERMOST = 16_384  # so near are a thread's first frames to where it waits, and to its stack's end
+"""Regions of the language's libraries, whose functions are around a middleware's on a stack."""
+_OUTERMOST = 16_384  # bytes of a waiting thread's stack in which its outermost frames are
 
 
 def _receives(thread: RunningThread, regions: Sequence[Region], middleware: Middleware) -> bool:
     """Whether a thread without a name receives for a middleware.
 
-    It does if it waits for a datagram, or for a word in the memory of a port, and the middleware's
-    function is the first on its stack. False too for one that runs just now, and without
-    ptrace(2)'s PTRACE_MODE_ATTACH.
+    It does if it waits for a datagram, or for a word in the shared memory of a port, and its
+    outermost function is the middleware's. It is not known (False) of a thread that runs just now,
+    and if we may not look at its memory (ptrace(2), PTRACE_MODE_ATTACH).
     """
     receive, futex = _SYSCALLS.get(platform.machine(), ((), -1))
     try:
         number, *values = read_proc(f"/proc/{thread.pid}/task/{thread.tid}/syscall").split()
         if len(values) < 8:  # it runs, or sleeps outside of a system call
             return False
-        word, stack = (region_at(regions, int(values[k], 16)) for k in (0, 6))
+        word = region_at(regions, int(values[0], 16))  # its first argument
+        top = int(values[6], 16)  # its stack pointer
+        stack = region_at(regions, top)
         at_port = int(number) == futex and word is not None and middleware.port_memory in word.path
         if stack is None or not (at_port or int(number) in receive):
             return False
-        top = int(values[6], 16)
         with Path(f"/proc/{thread.pid}/mem").open("rb") as memory:
             data = os.pread(memory.fileno(), min(_OUTERMOST, stack.end - top) & -8, top)
     except OSError:  # it ended, or may not be looked at
         return False
     lowest = regions[0].start
     for (address,) in reversed([*struct.iter_unpack("=Q", data)]):  # the outermost frame first
-        found = region_at(regions, address) if address >= lowest else None
-        if found is not None and found.executable and not _OF_LANGUAGE.search(found.path):
-            return middleware.receivers_wait_in in found.path
+        region = region_at(regions, address) if address >= lowest else None
+        if region is not None and region.executable and not _OF_LANGUAGE.search(region.path):
+            return middleware.receivers_wait_in in region.path
     return False
 
 
 def middleware_limit(process: RunningProcess) -> MiddlewareLimit | None:
-    """What is limited in a process that takes part in DDS, as far as its threads tell."""
-    others = [thread for thread in process.threads if thread.tid != process.pid]
-    if not process.participates or not others:
+    """Return what is limited in a process that takes part in DDS, as far as its threads tell."""
+    started = [thread for thread in process.threads if thread.tid != process.pid]
+    if not process.participates or not started:
         return None
-    if any(map(is_of_zenoh, others)):
+    if any(map(is_of_zenoh, started)):
         return ZENOH.limit
-    for thread in others:
+    for thread in started:
         if (limit := limit_by_thread(thread.comm)) is not None:
             return limit
-    return None if any(thread_work(thread.comm) is not None for thread in others) else "unnamed"
+    return None if any(thread_work(thread.comm) is not None for thread in started) else "unnamed"
 
 
 def takes_ros_arguments(command: Sequence[str]) -> bool:
+    """Whether a command line has arguments for ROS 2."""
     return "--ros-args" in command
 
 
 def named_nodes(command: Sequence[str]) -> tuple[str, ...]:
-    """Full names of the nodes that a command line names, in the order of their remap rules.
+    """Return the full names of the nodes that a command line names, in order of its remap rules.
 
     ``__node:=NAME`` and ``__ns:=/NAMESPACE`` apply to every node of the process,
-    ``OLD:__node:=NAME`` to the one that would be called OLD; the first that applies counts. Without
-    a rule a namespace is taken for `/`, which it is unless the program says otherwise.
+    ``OLD:__node:=NAME`` to the node that would be called OLD. The first rule that applies counts.
+    Without a rule, a node's namespace is taken to be `/`, as it is unless the program sets it.
 
         >>> named_nodes(["talker", "--ros-args", "-r", "__node:=front", "-r", "__ns:=/lidar"])
         ('/lidar/front',)
@@ -294,17 +305,21 @@ def named_nodes(command: Sequence[str]) -> tuple[str, ...]:
     namespaces: dict[str | None, str] = {}
     for rule in filter(None, map(_RULE.fullmatch, _remap_rules(command))):
         owner, name, namespace = rule.groups()
-        found = names if name else namespaces
-        if None not in found:  # rules behind one for all nodes never apply
-            found.setdefault(owner, name or namespace)
+        remapped = names if name else namespaces
+        if None not in remapped:  # rules behind one for all nodes never apply
+            remapped.setdefault(owner, name or namespace)
     if None not in names:  # nodes of which only the namespace is remapped
         names |= {owner: owner for owner in namespaces if owner and owner not in names}
     for_all = namespaces.get(None, "/")
-    full = (f"{namespaces.get(o, for_all).rstrip('/')}/{name}" for o, name in names.items())
-    return tuple(dict.fromkeys(full))
+    full_names = []
+    for owner, name in names.items():
+        namespace = namespaces.get(owner, for_all).rstrip("/")
+        full_names.append(f"{namespace}/{name}")
+    return tuple(dict.fromkeys(full_names))
 
 
 def _remap_rules(command: Sequence[str]) -> Iterator[str]:
+    """Yield the remap rules of a command line."""
     arguments = iter(command)
     for argument in arguments:
         if argument != "--ros-args":
@@ -319,7 +334,7 @@ def _remap_rules(command: Sequence[str]) -> Iterator[str]:
 
 
 def guessed_name(command: Sequence[str]) -> str | None:
-    """A node's name by that of its program: no more than a guess, None without a program."""
+    """Guess a node's full name from the name of its program; None: there is no program's name."""
     interpreted = bool(command) and re.fullmatch(r"python[0-9.]*", PurePath(command[0]).name)
     for argument in command[1:] if interpreted else command[:1]:
         if argument == "-c":

@@ -1,7 +1,7 @@
-"""How threads are scheduled: what this process may have, and setting and restoring any thread's.
+"""Read and set how threads are scheduled, and what this process is permitted.
 
-It has three **aspects**, which the kernel changes apart from each other: class (policy, priority
-and the flag that children start without it), nice value, cores.
+A thread's scheduling has three **aspects**, which the kernel changes one by one: class (policy,
+priority, and whether children start without them), nice value, cores.
 """
 
 import ctypes
@@ -28,7 +28,7 @@ _THROTTLE = "/proc/sys/kernel/sched_rt_{}_us"
 
 @dataclass(frozen=True)
 class SchedulingRequest:
-    """The class and the cores that a thread is to get; None: as it has."""
+    """The class and the cores that a thread is to get; None: what it has."""
 
     priority: int | None  # 0: SCHED_OTHER
     cores: tuple[int, ...] | None
@@ -52,7 +52,7 @@ class SchedulingClass:
 
 @dataclass(frozen=True)
 class SchedulingState:
-    """How a thread is scheduled, all but the numbers of SCHED_DEADLINE."""
+    """How a thread is scheduled, without the parameters of SCHED_DEADLINE."""
 
     scheduling_class: SchedulingClass
     nice: int
@@ -68,7 +68,7 @@ class SchedulingState:
 
 
 def state_of(tid: int) -> SchedulingState:
-    """How a thread is scheduled now. Raises ProcessLookupError: it has ended."""
+    """Return how a thread is scheduled now. Raises ProcessLookupError: it has ended."""
     policy, priority = os.sched_getscheduler(tid), os.sched_getparam(tid).sched_priority
     resets = bool(policy & RESET_ON_FORK)
     scheduling_class = SchedulingClass(policy & ~RESET_ON_FORK, priority, resets)
@@ -77,10 +77,11 @@ def state_of(tid: int) -> SchedulingState:
 
 
 def set_state(tid: int, target: SchedulingState) -> None:
-    """Give a thread the aspects of a state in which it differs.
+    """Give a thread a state, by changing the aspects in which it differs.
 
-    The class comes first: as SCHED_OTHER it would not run again where a FIFO thread spins. Raises
-    OSError: it has ended (ProcessLookupError), or the kernel refuses.
+    The class comes first: as SCHED_OTHER, a thread would not run any more on a core where a
+    SCHED_FIFO thread spins. Raises OSError: it has ended (ProcessLookupError), or the kernel
+    refuses.
     """
     for aspect in different_aspects(state_of(tid), target):
         if aspect == "scheduling_class":
@@ -94,7 +95,7 @@ def set_state(tid: int, target: SchedulingState) -> None:
 
 
 def after_wish(now: SchedulingState, wanted: SchedulingRequest) -> SchedulingState:
-    """The state of a thread after a request is fulfilled: what the request leaves open stays."""
+    """Return a thread's state after a request; what the request leaves open stays as it is."""
     if wanted.priority is not None:
         scheduling_class = replace(
             now.scheduling_class, policy=wanted.policy, priority=wanted.priority
@@ -104,12 +105,12 @@ def after_wish(now: SchedulingState, wanted: SchedulingRequest) -> SchedulingSta
 
 
 def different_aspects(first: SchedulingState, second: SchedulingState) -> list[Aspect]:
-    """The aspects in which two states differ, the class first."""
+    """Return the aspects in which two states differ, the class first."""
     return [aspect for aspect in ASPECTS if getattr(first, aspect) != getattr(second, aspect)]
 
 
 def with_aspect(state: SchedulingState, aspect: Aspect, source: SchedulingState) -> SchedulingState:
-    """Take an aspect from another state."""
+    """Return a state with one aspect taken from a ``source``."""
     values: dict[str, Any] = {aspect: getattr(source, aspect)}
     return replace(state, **values)
 
@@ -121,7 +122,7 @@ def state_from_json(values: dict[str, Any]) -> SchedulingState:
 
 
 def apply_scheduling(thread: RunningThread, wanted: SchedulingRequest) -> None:
-    """Give a thread, if it runs still, class and cores. Raises OperationError: it is refused."""
+    """Give a running thread class and cores. Raises OperationError: the kernel refuses."""
     try:
         set_state(thread.tid, after_wish(state_of(thread.tid), wanted))
     except ProcessLookupError:
@@ -132,7 +133,7 @@ def apply_scheduling(thread: RunningThread, wanted: SchedulingRequest) -> None:
 
 
 def become_fifo(priority: int) -> bool:
-    """Put the calling thread under SCHED_FIFO; False when that is not permitted."""
+    """Put the calling thread under SCHED_FIFO; return False if that is not permitted."""
     with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
         return True
@@ -140,7 +141,7 @@ def become_fifo(priority: int) -> bool:
 
 
 def may_use_fifo() -> bool:
-    """Whether SCHED_FIFO is permitted, found by asking for it on a thread that ends at once."""
+    """Whether SCHED_FIFO is permitted; a thread that ends at once asks for it."""
     answers: list[bool] = []
     thread = threading.Thread(target=lambda: answers.append(become_fifo(1)))
     thread.start()
@@ -149,12 +150,15 @@ def may_use_fifo() -> bool:
 
 
 def available_cores() -> tuple[int, ...]:
-    """The cores that the calling thread may use, ascending."""
+    """Return the cores that the calling thread may use, ascending."""
     return tuple(sorted(os.sched_getaffinity(0)))
 
 
 def check_cores(cores: dict[int, str]) -> None:
-    """Refuse cores (→ what asked for them) that are not available. Raises PlatformError."""
+    """Check that cores are available; each is given with what asks for it.
+
+    Raises PlatformError: one is not.
+    """
     available = available_cores()
     for core in sorted(cores.keys() - set(available)):
         raise PlatformError(
@@ -164,21 +168,21 @@ def check_cores(cores: dict[int, str]) -> None:
 
 
 def lock_memory() -> bool:
-    """Lock all pages of this process in memory, now and later; False when not permitted."""
+    """Lock all pages of this process in memory, now and later; return False if not permitted."""
     return bool(_libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) == 0)
 
 
 def stop_garbage_collection() -> None:
-    """No garbage collection from here on: a full collection pauses a process for milliseconds."""
+    """Stop garbage collection for good, since a full one pauses the process for milliseconds."""
     gc.collect()
     gc.freeze()
     gc.disable()
 
 
 def signalled_with_parent(parent_pid: int, number: signal.Signals) -> None:
-    """Have the kernel send this process a signal when its parent dies, however that happens."""
+    """Have the kernel send this process a signal when its parent ends, however that happens."""
     _libc.prctl(_PR_SET_PDEATHSIG, number, 0, 0, 0)
-    if os.getppid() != parent_pid:  # it died before the request was in force
+    if os.getppid() != parent_pid:  # it had ended before the kernel was asked
         os.kill(os.getpid(), number)
 
 
@@ -188,11 +192,10 @@ def set_thread_name(name: str) -> None:
 
 
 def throttle_fraction() -> float:
-    """Share of a core that SCHED_FIFO may use before the kernel stops it; 1.0 is no limit."""
+    """Return the share of a core that real-time threads may use; 1.0: there is no limit."""
     try:
-        runtime, period = (
-            int(Path(_THROTTLE.format(n)).read_bytes()) for n in ("runtime", "period")
-        )
+        runtime = int(Path(_THROTTLE.format("runtime")).read_bytes())
+        period = int(Path(_THROTTLE.format("period")).read_bytes())
     except (OSError, ValueError):
         return 1.0
     return 1.0 if runtime < 0 else runtime / period

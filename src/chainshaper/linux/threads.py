@@ -1,7 +1,7 @@
 """Threads as the kernel shows them, and what their names say.
 
-A thread is identified by its id *and* its start: ids are used again. The names of a
-middleware's threads are in :mod:`chainshaper.values.middleware`.
+A thread is identified by its id *and* its start, since ids are used again. The names of the threads
+of middlewares are in :mod:`chainshaper.values.middleware`.
 
 Upstream: proc(5).
 """
@@ -21,11 +21,11 @@ from chainshaper.values.middleware import ThreadWork, is_runtime_name, runtime_w
 
 SCHED_DEADLINE = 6
 RESET_ON_FORK = getattr(os, "SCHED_RESET_ON_FORK", 0x40000000)
-"""A flag that shares the word with the policy."""
+"""A flag that is in the same number as the policy."""
 TICK_NS = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
-"""The kernel shows the start of a thread in ticks of 10 ms."""
-_STARTED = 19  # of the fields of /proc/…/stat from the state on
-_DEAD = {b"Z", b"X"}
+"""The unit in which the kernel shows when a thread started, mostly 10 ms."""
+_STARTED = 19  # the place of a thread's start in the fields of `read_stat`
+_DEAD = {b"Z", b"X"}  # states of threads that have ended
 
 _OF_PYTHON = ("SCHED_OTHER", "SCHED_FIFO", "SCHED_RR", "SCHED_BATCH", "SCHED_IDLE")
 POLICIES: dict[int, str] = {getattr(os, name): name for name in _OF_PYTHON}
@@ -33,16 +33,16 @@ POLICIES[SCHED_DEADLINE] = "SCHED_DEADLINE"
 POLICIES[7] = "SCHED_LITMUS" if Path("/proc/litmus").is_dir() else "SCHED_EXT"
 
 ThreadRole: TypeAlias = Literal["executor", "publisher", "dds", "unknown"]
-"""``publisher``: sends what executors hand over to it (asynchronous publication, section 2.2)."""
+"""``publisher``: sends what executors hand over to it (paper, section 2.2)."""
 
 
 def gate_thread_name(node: str) -> str:
-    """The name of a gate's thread in its publisher's process, which fits into 15 characters."""
+    """Return the name of a gate's thread in its publisher's process; it has 13 characters."""
     return f"gate-{zlib.crc32(node.strip('/').encode()):08x}"
 
 
 def role_of(comm: str, is_main: bool) -> ThreadRole:
-    """The role of a thread of a node's process, as far as its name shows."""
+    """Return the role of a thread of a node's process, as far as its name shows."""
     if is_main:
         return "executor"  # executors spin there, unless a program arranges it otherwise
     kind = thread_work(comm)
@@ -60,7 +60,7 @@ class RunningThread:
     comm: str  # its name
     role: ThreadRole
     policy: str  # such as SCHED_FIFO
-    priority: int  # of real-time threads; 0: of no others
+    priority: int  # of a real-time thread; 0: of all other threads
     cores: tuple[int, ...]  # where it may run
     started: int = 0  # ticks (TICK_NS) after the machine booted
     inner_tid: int = 0  # its id in its own pid namespace, which tracers record in a container
@@ -77,7 +77,7 @@ class RunningThread:
 
 
 def list_threads(pid: int) -> tuple[RunningThread, ...]:
-    """The threads of a process, main thread first; empty when the process is gone."""
+    """Return the threads of a process, the main thread first; empty: the process has ended."""
     try:
         tids = [int(name) for name in os.listdir(f"/proc/{pid}/task")]  # noqa: PTH208 - quicker
         inner_pid = innermost_id(read_proc(f"/proc/{pid}/status"))
@@ -101,14 +101,17 @@ def is_of_zenoh(thread: RunningThread) -> bool:
 
 
 def find_thread(tid: int) -> RunningThread | None:
-    """The thread with this id, None when there is none."""
+    """Return the thread with an id; None: there is none."""
     with suppress(OSError):
         return _thread(status_field(read_proc(f"/proc/{tid}/status"), "Tgid")[0], tid, None)
     return None
 
 
 def _thread(pid: int, tid: int, inner_pid: int | None) -> RunningThread | None:
-    """A thread, if it runs still, by reading one file: there are thousands, every second."""
+    """Read a thread; None: it has ended.
+
+    It is read from a single file where possible, since this happens to thousands every second.
+    """
     folder = f"/proc/{pid}/task/{tid}"
     try:
         comm, fields = read_stat(folder)
@@ -134,32 +137,36 @@ def _thread(pid: int, tid: int, inner_pid: int | None) -> RunningThread | None:
 
 
 def all_stats() -> Iterator[tuple[int, list[bytes]]]:
-    """All processes with the fields of :func:`read_stat`, by id."""
+    """Yield all processes by id, with the fields of :func:`read_stat`."""
     for pid in sorted(int(name) for name in os.listdir("/proc") if name.isdigit()):  # noqa: PTH208
         with suppress(OSError):  # it ended meanwhile
             yield pid, read_stat(f"/proc/{pid}")[1]
 
 
 def living_processes() -> Iterator[tuple[int, int]]:
-    """All processes but zombies by id and start, those of containers by their ids there, too."""
+    """Yield all processes except zombies by id and start.
+
+    A process of another pid namespace, as in a container, comes with its id there as well.
+    """
     for pid, fields in all_stats():
         with suppress(OSError):  # it ended meanwhile
             if fields[0] not in _DEAD:
                 status = read_proc(f"/proc/{pid}/status")
                 started = int(fields[_STARTED])
-                yield from ((known, started) for known in {pid, innermost_id(status) or pid})
+                for known_as in {pid, innermost_id(status) or pid}:
+                    yield known_as, started
 
 
 def parents() -> dict[int, int]:
-    """All processes with their parents, by id."""
+    """Return the parent of each process, by id."""
     return {pid: int(fields[1]) for pid, fields in all_stats()}
 
 
 def read_proc(path: str | Path, folder: int | None = None) -> bytes:
     """Read a whole file of /proc or /sys, or of an open ``folder`` in it.
 
-    It is bytes, since who names a program, a file or a group may choose any. Raises OSError: the
-    file is gone, or reading it is forbidden.
+    It is bytes, since names of programs, files and groups may be any. Raises OSError: the file is
+    gone, or reading it is forbidden.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC, dir_fd=folder)
     with os.fdopen(descriptor, "rb", buffering=0) as file:
@@ -167,16 +174,16 @@ def read_proc(path: str | Path, folder: int | None = None) -> bytes:
 
 
 def lines_of(content: bytes) -> list[bytes]:
-    """The lines of a file of the kernel, which ends each with a line feed.
+    """Return the lines of a file of the kernel, which end with a line feed and nothing else.
 
-    Names in them may have whatever else ends a line elsewhere: with `splitlines`, a program that is
+    Names in them may have other characters that end lines elsewhere: with `splitlines`, a program
     called ``a\\rUid:\\t0`` would be root's.
     """
     return content.removesuffix(b"\n").split(b"\n")
 
 
 def read_stat(folder: str) -> tuple[str, list[bytes]]:
-    """A task's name, and the fields of /proc/…/stat from its state on (proc(5), the third)."""
+    """Return a task's name, and the fields of its `stat` from the third on, its state (proc(5))."""
     stat = read_proc(f"{folder}/stat")
     name_end = stat.rindex(b")")  # a name may contain spaces and brackets
     name = stat[stat.index(b"(") + 1 : name_end]
@@ -188,10 +195,10 @@ def read_stat(folder: str) -> tuple[str, list[bytes]]:
 
 @functools.cache
 def _started_later() -> int:
-    """By how many ticks our time namespace has the kernel show starts too late to us.
+    """Return by how many ticks the kernel shows starts too late in our time namespace.
 
-    See time_namespaces(7). Without this offset, processes outside the namespace would know a
-    process by another start than we do.
+    See time_namespaces(7). If these ticks were not taken off, processes outside the namespace would
+    know a process by another start than we do.
     """
     with suppress(OSError, ValueError):  # before Linux 5.6
         for line in lines_of(read_proc("/proc/self/timens_offsets")):
@@ -204,48 +211,49 @@ def _started_later() -> int:
 def of_another_clock(pid: int) -> bool:
     """Whether a process may see another CLOCK_MONOTONIC than we do.
 
-    It has then a time namespace of its own (time_namespaces(7)), as containers may have that were
-    moved here while they ran.
+    It may if it is in another time namespace (time_namespaces(7)), as in a container that was moved
+    here while it ran.
     """
     return time_namespace(pid) not in (0, time_namespace())
 
 
 def time_namespace(pid: int | Literal["self"] = "self") -> int:
-    """The time namespace of a process (its inode); 0: not known."""
+    """Return the time namespace of a process (its inode); 0: it is not known."""
     with suppress(OSError):  # it has ended, is another user's, or the kernel is older than 5.6
         return Path(f"/proc/{pid}/ns/time").stat().st_ino
     return 0
 
 
 def since_boot_ns() -> int:
-    """For how long the machine has run, sleep included: the clock of
-    :attr:`RunningThread.started`.
+    """Return how long ago the machine booted, its sleep included.
+
+    That is the clock of :attr:`RunningThread.started`.
     """
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - _started_later() * TICK_NS
 
 
 def status_field(status: bytes, name: str, base: int = 10) -> list[int]:
-    """The numbers of one line of /proc/…/status, empty where it has no such line."""
+    """Return the numbers in a line of /proc/…/status; empty: it has no such line."""
     start = f"{name}:".encode()
     line = next((line for line in lines_of(status) if line.startswith(start)), b"")
     return [int(number, base) for number in line.split()[1:]]
 
 
 def innermost_id(status: bytes) -> int | None:
-    """A task's id in its own pid namespace: the last number of `NSpid:` in /proc/…/status."""
+    """Return a task's id in its own pid namespace, the last number of `NSpid:` in its status."""
     numbers = status_field(status, "NSpid")
     return numbers[-1] if numbers else None
 
 
 def start_of(pid: int, tid: int) -> int | None:
-    """When a thread started, in clock ticks since the machine booted; None if there is none."""
+    """Return when a thread started, in ticks after the machine booted; None: there is none."""
     with suppress(OSError):
         return int(read_stat(f"/proc/{pid}/task/{tid}")[1][_STARTED])
     return None
 
 
 def has_ended(tid: int, started: int) -> bool:
-    """Whether the thread that started then is gone, or a zombie."""
+    """Whether the thread with this id and start has ended; a zombie has."""
     with suppress(OSError):
         fields = read_stat(f"/proc/{tid}")[1]
         return int(fields[_STARTED]) != started or fields[0] in _DEAD
@@ -253,7 +261,7 @@ def has_ended(tid: int, started: int) -> bool:
 
 
 def open_process(pid: int, started: int) -> int | None:
-    """A pidfd of the process that started then, None when it has ended."""
+    """Open a pidfd of the process with this id and start; None: it has ended."""
     with suppress(ProcessLookupError):
         pidfd = os.pidfd_open(pid)
         if start_of(pid, pid) == started:
@@ -263,8 +271,11 @@ def open_process(pid: int, started: int) -> int | None:
 
 
 def foreign_realtime_processes() -> tuple[str, ...]:
-    """Others' processes with real-time threads, as ``comm (pid)``: they spoil measurements."""
-    found = []
+    """Return real-time threads of other programs, which spoil measurements, as ``comm (pid)``.
+
+    It is one thread of each process.
+    """
+    foreign = []
     for pid, parent in parents().items():
         try:
             command = read_proc(f"/proc/{pid}/cmdline")
@@ -274,6 +285,8 @@ def foreign_realtime_processes() -> tuple[str, ...]:
             continue
         if os.getpid() in (pid, parent) or not command or enforces:
             continue
-        realtime = [t for t in list_threads(pid) if t.policy in ("SCHED_FIFO", "SCHED_RR")]
-        found += [f"{thread.comm} ({pid})" for thread in realtime[:1]]
-    return tuple(sorted(found))
+        for thread in list_threads(pid):
+            if thread.policy in ("SCHED_FIFO", "SCHED_RR"):
+                foreign.append(f"{thread.comm} ({pid})")
+                break
+    return tuple(sorted(foreign))

@@ -365,10 +365,12 @@ class Watch:
 
     def look(self) -> Seen:
         """Look at all chains; cycles that began ``longest_ns`` ago or earlier are counted."""
+        # Before it reads: it may be held up meanwhile, and has not read what came then.
+        now = time.monotonic_ns()
         self.read()
-        now, offset = time.monotonic_ns(), clock_offset()
+        offset = clock_offset()
         if abs(offset - self._clock_offset_ns) > _STEP_NS:
-            self._stepped_ns = now
+            self._stepped_ns = time.monotonic_ns()
         self._clock_offset_ns = offset
         over = now - self.longest_ns
         since = now - 2 * self.longest_ns - (over - self._over_ns)

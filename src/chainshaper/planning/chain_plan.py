@@ -410,7 +410,7 @@ def publish_slots(plan: ChainPlan) -> tuple[Slot, ...]:
 def band_predictions(plan: ChainPlan) -> tuple[BandPrediction, ...]:
     """Return the prediction of each band; of none where nothing is shaped.
 
-    There is none either where somebody has added or removed a slot in the plan's file.
+    There is none either where a user has added or removed a slot in the plan's file.
     """
     slots, shares = publish_slots(plan), plan.predicted.shares
     if len(slots) != len(shares):

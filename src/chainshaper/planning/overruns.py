@@ -382,9 +382,9 @@ def _about_late_outputs(plan: ChainPlan) -> Iterator[str]:
         text += f" {independent} independent ones, too few to say how late one output in a hundred"
         yield f"{text} will be. Record {more} cycles or more."
     elif fewest < needed:
-        of = " of a mode" if fewest < cycles else ""
-        text = f"the sample is small: {fewest} cycles{of} are too few to say how late one output in"
-        yield f"{text} a hundred will be. Record {needed} cycles{of} or more."
+        kind = "cycles of a mode" if fewest < cycles else "cycles"
+        text = f"the sample is small: {fewest} {kind} are too few to say how late one output in"
+        yield f"{text} a hundred will be. Record {needed} {kind} or more."
     stall = evidence.longest_stall_ns
     stall_text = "" if stall is None else f", longest stall {milliseconds(stall)} ms"
     if evidence.all_disturbed:
@@ -404,7 +404,7 @@ def _about_late_outputs(plan: ChainPlan) -> Iterator[str]:
 
 
 def _about_receivers(plan: ChainPlan) -> Iterator[str]:
-    """Who receives an output without a place in the plan, or a promise."""
+    """Say which nodes receive an output without a place in the plan, or a promise."""
     node = plan.shaping_node
     if node is not None and node.receivers and node.receivers_at is None:
         text = f"{', '.join(node.receivers)}, which get {node.output}, run below all servers, and"
@@ -440,7 +440,7 @@ def modes_with_one_slot(plan: ChainPlan) -> Iterator[tuple[tuple[str, ...], Slot
 
 
 def _about_evidence(plan: ChainPlan) -> Iterator[str]:
-    """What is doubtful about the measurements, or about how much of the cycle is used."""
+    """Say what is doubtful about the measurements, or about how much of the cycle is used."""
     for modes, slot in modes_with_one_slot(plan):
         opens, closes = map(milliseconds, slot)
         yield (
@@ -483,6 +483,6 @@ def _about_evidence(plan: ChainPlan) -> Iterator[str]:
 
 
 def slots_of_latency(plan: ChainPlan) -> tuple[Slot, ...]:
-    """The publish slots as latencies: under LET, and in a pipeline, they are of a later cycle."""
+    """Return the publish slots as latencies: under LET, and in a pipeline, of a later cycle."""
     delay = cycles_until_output(plan) * plan.cycle_ns
     return tuple((start + delay, end + delay) for start, end in plans.publish_slots(plan))

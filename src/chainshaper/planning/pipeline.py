@@ -5,28 +5,29 @@ of its own, shorter than the cycle. While stage 2 works on one instance, stage 1
 The output leaves once a cycle, in order, when the slowest instance would be through: at a constant
 latency of several cycles, as the shaping node sees by the stamp.
 
-**What a callback takes** is counted from the message before it to its own, without the time for
-which other instances of the chain had its core: the same whether instances piled up or not. Where
-branches join, it is counted from the message that came last.
+**How long a callback takes** is counted from the message before it to its own, without the time for
+which other instances of the chain had its core. So it is the same whether instances piled up or
+not. Where branches join, it is counted from the message that came last.
 
-**Stages.** A stage is a set of nodes on one core; none may wait for another that waits for it. On
-the axis of the chain's latency it begins when all executions of the stages that it waits for were
-over: s_b ≥ s_a + W_a, with W_a the longest time that the callbacks of a took together, in one
-instance. The stage with the chain's first callback begins at 0, one with the first callback of
-another branch not before that did. As in eq. 1, its slot is [s, s + W + ε); it repeats every cycle,
-so it is a cycle long at most, and modulo CT two slots of one core do not overlap: a stage may wait
-for its turn. The ε of a stage lies beside the next one, which may be late by it: one ε serves the
-whole chain.
+**Stages.** A stage is a set of nodes on one core; no two stages may wait for each other. On the
+axis of the chain's latency a stage b begins when all executions of each stage a that it waits for
+were over: s_b ≥ s_a + W_a, with W_a the longest time that the callbacks of a took together, in one
+instance. The stage with the chain's first callback begins at 0; a stage with the first callback of
+another branch begins no earlier than that callback did. As in eq. 1, the slot of a stage is [s, s +
+W + ε). It repeats every cycle, so it is a cycle long at most, and modulo CT two slots of one core
+do not overlap: a stage may wait for its turn. The ε of a stage lies beside the next stage, which
+may be late by it: one ε serves the whole chain.
 
-**Search.** The shortest cut is that with the earliest end; of several, with the fewest stages, then
-the fewest cores. Nodes join stages one after the other, in an order in which none comes before what
-it waits for. Once all are in one, turns are chosen, and the starts obey difference constraints
-(s_b ≥ s_a + constant), whose least solution is a longest path. What is chosen is searched in depth,
-bounded by what the rest takes at least. After :data:`MOST_STEPS` the best so far has to do.
+**Search.** The shortest cut is that with the earliest end; of several, that with the fewest stages,
+then the fewest cores. Nodes join stages one after the other, in an order in which each comes behind
+those it waits for. Once all nodes are in stages, turns are chosen. Then the starts obey difference
+constraints (s_b ≥ s_a + constant), whose least solution is a longest path. The search goes depth
+first, and gives up a branch when even the least that the rest takes is too long. After
+:data:`MOST_STEPS` it takes the best cut so far.
 
-**Slots that open early.** The longest of all stages never come in one instance. So slots open as
-soon as the first data may come, unless another stage has the core then, or a slot would be longer
-than a cycle. With a core for each stage, all is over by the chain's own L̄ + ε.
+**Slots that open early.** The longest executions of all stages never come in one instance. So slots
+open as soon as the first data may come, unless another stage has the core then, or a slot would be
+longer than a cycle. With a core for each stage, all is over by the chain's own L̄ + ε.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -44,8 +45,8 @@ from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.yaml_file import wrong_values_refused
 
-MOST_STEPS = 60_000  # of the search, which take some seconds
-_Key = tuple[int, int, int]  # what is minimal: end, stages, cores
+MOST_STEPS = 60_000  # of the search: they take some seconds
+_Key = tuple[int, int, int]  # what is minimised: end, number of stages, number of cores
 _Turn = tuple[int, int, int]  # stages a and b of one core, and how many cycles lie between
 
 
@@ -55,14 +56,15 @@ def finished(
     begins_ns: Sequence[int],
     cores: Sequence[int] | None = None,
 ) -> NDArray[np.int64]:
-    """When each step of a graph is over at the latest: a row per instance, as in ``steps_ns``, and
-    a column per step (ns).
+    """Return when each step of a graph is over at the latest (ns).
 
-    A step comes behind all those ``after`` which it stands; one that stands after none begins
-    ``begins_ns`` behind its instance. With ``cores``, the core of each step, a step waits for its
-    core too, in whatever order the core runs what is ready: before it may come every step of the
-    same core that is neither before nor behind it in the graph. On one way through the graph each
-    of these is waited for once (Graham's bound for list scheduling, 1969, for fixed cores).
+    There is a row for each instance, as in ``steps_ns``, and a column for each step. A step comes
+    behind all steps in its ``after``; one without such begins ``begins_ns`` behind its instance.
+
+    With ``cores``, the core of each step, a step waits for its core too, in whatever order the core
+    runs what is ready: every step of the same core that is neither before nor behind it in the
+    graph may come before it. On one way through the graph each of these is waited for once
+    (Graham's bound for list scheduling, 1969, for fixed cores).
     """
     beside = _beside(after, cores) if cores else [frozenset[int]()] * len(after)
     done = np.zeros_like(steps_ns)
@@ -83,7 +85,7 @@ def finished(
 
 
 def _beside(after: Sequence[Sequence[int]], cores: Sequence[int]) -> list[frozenset[int]]:
-    """For each step of a graph those of its core that may run before it or behind it."""
+    """Return, for each step of a graph, those of its core that may run before it or behind it."""
     before: list[set[int]] = []
     for inputs in after:
         before.append(set(inputs).union(*(before[step] for step in inputs)))
@@ -103,38 +105,35 @@ def _beside(after: Sequence[Sequence[int]], cores: Sequence[int]) -> list[frozen
 
 @dataclass(frozen=True)
 class Work:
-    """What is cut: units of callbacks that one thread has to run, each behind what it waits for.
+    """What is cut into stages: units of callbacks that one thread has to run.
 
-    ``nodes`` are those of each unit, ``after`` the units that it waits for, all before it; the last
-    one publishes the output. ``steps_ns`` has a row per instance and a column per unit. The chain
-    begins with the unit ``first``; any other that waits for none begins its part of an instance
-    ``begins_ns`` later.
+    Each unit comes behind those it waits for; the last one publishes the output.
     """
 
-    nodes: tuple[tuple[str, ...], ...]
-    after: tuple[tuple[int, ...], ...]
-    steps_ns: NDArray[np.int64]
-    begins_ns: tuple[int, ...]
-    first: int = 0
+    nodes: tuple[tuple[str, ...], ...]  # of each unit
+    after: tuple[tuple[int, ...], ...]  # the units that each unit waits for
+    steps_ns: NDArray[np.int64]  # how long each unit took: a row per instance, a column per unit
+    begins_ns: tuple[int, ...]  # when each unit that waits for none begins, behind its instance
+    first: int = 0  # the unit with which the chain begins
 
     @cached_property
     def finished_ns(self) -> NDArray[np.int64]:
-        """When each unit is over in each instance, if it waits for no core."""
+        """When each unit is over in each instance, if it waits for no core (as ``steps_ns``)."""
         return finished(self.after, self.steps_ns, self.begins_ns)
 
     def longest_ns(self, members: Sequence[int]) -> int:
-        """The longest that these units took together, in one instance."""
+        """Return the longest time that these units took together, in one instance."""
         return int(self.steps_ns[:, [*members]].sum(axis=1).max())
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Units on a core, and their slot, with the margin, on the latency's axis."""
+    """Units on a core, and their slot on the axis of the chain's latency."""
 
-    members: tuple[int, ...]
-    place: int
+    members: tuple[int, ...]  # its units
+    place: int  # of its core among the cores of the pipeline
     opens_ns: int
-    closes_ns: int
+    closes_ns: int  # the margin is in it
 
 
 def work_of(
@@ -144,34 +143,41 @@ def work_of(
     begins_ns: Sequence[int],
     first: int = 0,
 ) -> Work:
-    """The work of callbacks, of which those of one node are one unit, and so is what lies between
-    them. Each callback comes behind those that it waits for.
+    """Return the work of callbacks, each of which comes behind those it waits for.
+
+    The callbacks of one node are one unit, together with those that lie between them.
     """
     unit_of = _units(nodes, after)
-    members = [[k for k, unit in enumerate(unit_of) if unit == u] for u in range(1 + max(unit_of))]
+    members: list[list[int]] = [[] for _ in range(1 + max(unit_of))]
+    for callback, unit in enumerate(unit_of):
+        members[unit].append(callback)
     waits = [
-        tuple(sorted({unit_of[before] for k in own for before in after[k]} - {unit}))
-        for unit, own in enumerate(members)
+        tuple(sorted({unit_of[before] for member in of_unit for before in after[member]} - {unit}))
+        for unit, of_unit in enumerate(members)
     ]
     return Work(
-        nodes=tuple(tuple(dict.fromkeys(nodes[k] for k in own)) for own in members),
+        nodes=tuple(tuple(dict.fromkeys(nodes[member] for member in unit)) for unit in members),
         after=tuple(waits),
-        steps_ns=np.stack([steps_ns[:, own].sum(axis=1) for own in members], axis=1),
-        begins_ns=tuple(max(begins_ns[k] for k in own) for own in members),
+        steps_ns=np.stack([steps_ns[:, unit].sum(axis=1) for unit in members], axis=1),
+        begins_ns=tuple(max(begins_ns[member] for member in unit) for unit in members),
         first=unit_of[first],
     )
 
 
 def _units(nodes: Sequence[str], after: Sequence[Sequence[int]]) -> list[int]:
-    """The unit of each callback, numbered behind what they wait for."""
+    """Return the unit of each callback; a unit's number is larger than those it waits for.
+
+    Two callbacks are in one unit where each is reached from the other, by what it waits for or by
+    being of one node.
+    """
     reached = np.eye(len(nodes), dtype=bool)
-    for k, before in enumerate(after):
-        reached[k, [*before]] = True
-    reached |= np.array([[one == two for two in nodes] for one in nodes])
+    for callback, before in enumerate(after):
+        reached[callback, [*before]] = True
+    reached |= np.array([[node == other_node for other_node in nodes] for node in nodes])
     for between in range(len(nodes)):
         reached |= np.outer(reached[:, between], reached[between])
     together = reached & reached.T
-    home = [int(np.argmax(row)) for row in together]
+    home = [int(np.argmax(row)) for row in together]  # the first callback of each one's unit
     order: list[int] = []
     while len(order) < len(set(home)):
         ready = (
@@ -180,150 +186,163 @@ def _units(nodes: Sequence[str], after: Sequence[Sequence[int]]) -> list[int]:
             if unit not in order
             and all(
                 home[before] in (*order, unit)
-                for k, own in enumerate(home)
-                if own == unit
-                for before in after[k]
+                for callback, unit_home in enumerate(home)
+                if unit_home == unit
+                for before in after[callback]
             )
         )
         order.append(next(ready))
-    return [order.index(one) for one in home]
+    return [order.index(unit) for unit in home]
 
 
 def shortest_cut(
     work: Work, margin_ns: int, cycle_ns: int, places: int
 ) -> tuple[Stage, ...] | None:
-    """The stages of the shortest cut, in the order in which they begin; None where there is none on
-    so many cores.
+    """Return the stages of the shortest cut, in the order in which they begin.
+
+    None: there is no cut on so many cores (``places``).
     """
     search = _Search(work, margin_ns, cycle_ns, places)
-    search.go_on(0, [], [])
+    search.assign_next(0, [], [])
     if search.best is None:
         return None
     _, stages, places_of, starts = search.best
-    lengths = [work.longest_ns(own) for own in stages]
-    found = [
-        Stage(tuple(own), place, start, start + length + margin_ns)
-        for own, place, start, length in zip(stages, places_of, starts, lengths, strict=True)
+    cut = [
+        Stage(tuple(units), place, start, start + work.longest_ns(units) + margin_ns)
+        for units, place, start in zip(stages, places_of, starts, strict=True)
     ]
-    return tuple(sorted(found, key=lambda one: (one.opens_ns, one.members)))
+    return tuple(sorted(cut, key=lambda stage: (stage.opens_ns, stage.members)))
 
 
 class _Search:
-    """The search for the shortest cut: the best so far, and how many steps that took."""
+    """The search for the shortest cut.
+
+    A stage is a list of its units here; ``places_of`` are the places of the stages' cores.
+    """
 
     def __init__(self, work: Work, margin_ns: int, cycle_ns: int, places: int) -> None:
         self.work, self.margin_ns, self.cycle_ns, self.places = work, margin_ns, cycle_ns, places
+        # The best cut so far: its key, its stages, the places of their cores, their starts.
         self.best: tuple[_Key, list[list[int]], list[int], list[int]] | None = None
         self.steps = 0
         self._lasting: dict[tuple[int, ...], int] = {}
         self._least: dict[tuple[tuple[int, ...], int], int] = {}
         behind: list[list[int]] = [[] for _ in work.after]
-        for unit, before in enumerate(work.after):
-            for one in before:
-                behind[one].append(unit)
+        for unit, inputs in enumerate(work.after):
+            for before in inputs:
+                behind[before].append(unit)
         self._behind = behind
-        self._tail = np.zeros_like(work.steps_ns)  # what comes behind each unit, on its way
+        # How long the longest way behind each unit takes: a row per instance, a column per unit.
+        self._tail = np.zeros_like(work.steps_ns)
         for unit in reversed(range(len(behind))):
             for later in behind[unit]:
                 longer = work.steps_ns[:, later] + self._tail[:, later]
                 self._tail[:, unit] = np.maximum(self._tail[:, unit], longer)
 
-    def lasting(self, members: Sequence[int]) -> int:
-        """W of a stage."""
-        key = tuple(members)
+    def lasting(self, units: Sequence[int]) -> int:
+        """Return W of a stage."""
+        key = tuple(units)
         if key not in self._lasting:
             self._lasting[key] = self.work.longest_ns(key)
         return self._lasting[key]
 
-    def least(self, members: Sequence[int], assigned: int) -> int:
-        """How long it takes at least from the start of a stage to the end of all, if the units from
-        ``assigned`` on may be in it.
+    def least(self, units: Sequence[int], assigned: int) -> int:
+        """Return how long it takes at least from the start of a stage to the end of all.
+
+        The units from ``assigned`` on are in no stage yet, and may come into this one.
         """
-        key = tuple(members), assigned
+        key = tuple(units), assigned
         if key not in self._least:
-            took = self.work.steps_ns[:, [*members]].sum(axis=1)
-            later = {one for unit in members for one in self._behind[unit] if one >= assigned}
-            rest = [self.work.steps_ns[:, one] + self._tail[:, one] for one in later]
+            took = self.work.steps_ns[:, [*units]].sum(axis=1)
+            later = {after for unit in units for after in self._behind[unit] if after >= assigned}
+            rest = [self.work.steps_ns[:, unit] + self._tail[:, unit] for unit in later]
             total = took + np.max(rest, axis=0) if rest else took
             self._least[key] = int(total.max())
         return self._least[key]
 
-    def go_on(self, assigned: int, stages: list[list[int]], places_of: list[int]) -> None:
-        """Try all stages for the next unit, the most promising first."""
+    def assign_next(self, assigned: int, stages: list[list[int]], places_of: list[int]) -> None:
+        """Try all stages for the next unit, ``assigned``, the most promising first."""
         if assigned == len(self.work.after):
             self._choose_turns(stages, places_of)
             return
-        used, ways = max(places_of, default=-1) + 1, []
-        options = [(number, place) for number, place in enumerate(places_of)]
-        options += [(len(stages), place) for place in range(min(used + 1, self.places))]
-        for number, place in options:
+        ways = []
+        used = max(places_of, default=-1) + 1
+        for number in range(len(stages)):  # into a stage that is there
+            longer = [list(units) for units in stages]
+            longer[number].append(assigned)
+            ways.append((longer, places_of))
+        for place in range(min(used + 1, self.places)):  # into a new stage
+            ways.append(([*map(list, stages), [assigned]], [*places_of, place]))
+        bounded = []
+        for longer, places in ways:
             self.steps += 1
-            longer = [list(own) for own in stages] + [[]] * (number == len(stages))
-            longer[number] = [*longer[number], assigned]
-            where = [*places_of, place][: len(longer)]
-            if (least := self._bound(longer, where, assigned + 1)) is not None:
-                ways.append((least, longer, where))
-        for least, longer, where in sorted(ways):
+            least = self._bound(longer, places, assigned + 1)
+            if least is not None:
+                bounded.append((least, longer, places))
+        for least, longer, places in sorted(bounded):
             if self.steps < MOST_STEPS and (self.best is None or least < self.best[0]):
-                self.go_on(assigned + 1, longer, where)
+                self.assign_next(assigned + 1, longer, places)
 
     def _bound(self, stages: list[list[int]], places_of: list[int], assigned: int) -> _Key | None:
-        """Below which nothing comes of these stages; None: nothing at all."""
+        """Return the least key of any cut with these stages; None: there is no such cut."""
         room = [self.cycle_ns] * self.places
-        for own, place in zip(stages, places_of, strict=True):
-            room[place] -= self.lasting(own) + self.margin_ns
+        for units, place in zip(stages, places_of, strict=True):
+            room[place] -= self.lasting(units) + self.margin_ns
             if room[place] < 0:
                 return None
         edges = self._edges(stages)
         starts = self._starts(stages, edges, []) if _acyclic(edges) else None
         if starts is None:
             return None
-        ends = (s + self.least(own, assigned) for s, own in zip(starts, stages, strict=True))
-        return max(ends), len(stages), len(set(places_of))
+        end = max(
+            start + self.least(units, assigned) for start, units in zip(starts, stages, strict=True)
+        )
+        return end, len(stages), len(set(places_of))
 
     def _edges(self, stages: list[list[int]]) -> list[_Turn]:
-        """Which stages wait for which, and how long the former take."""
-        home = {unit: number for number, own in enumerate(stages) for unit in own}
-        found = {
+        """Return stages a and b of which b waits for a, with how long a takes."""
+        home = {unit: number for number, units in enumerate(stages) for unit in units}
+        pairs = {
             (home[before], number)
             for unit, number in home.items()
             for before in self.work.after[unit]
             if home[before] != number
         }
-        return [(one, two, self.lasting(stages[one])) for one, two in found]
+        return [(former, later, self.lasting(stages[former])) for former, later in pairs]
 
     def _starts(
         self, stages: list[list[int]], edges: list[_Turn], turns: list[_Turn]
     ) -> list[int] | None:
-        """The earliest starts of the stages, None where they cannot take these turns."""
-        work, after = self.work, list(edges)
-        for one, two, between in turns:
-            lasts, other = self.lasting(stages[one]), self.lasting(stages[two])
-            after.append((one, two, lasts + self.margin_ns + between * self.cycle_ns))
-            after.append((two, one, other + self.margin_ns - (between + 1) * self.cycle_ns))
-        starts = [max(0, *(work.begins_ns[unit] for unit in own)) for own in stages]
+        """Return the earliest starts of the stages; None: they cannot take these turns."""
+        work, distances = self.work, list(edges)  # the second starts so long after the first
+        for former, later, between in turns:
+            lasts = self.lasting(stages[former]) + self.margin_ns
+            distances.append((former, later, lasts + between * self.cycle_ns))
+            lasts = self.lasting(stages[later]) + self.margin_ns
+            distances.append((later, former, lasts - (between + 1) * self.cycle_ns))
+        starts = [max(0, *(work.begins_ns[unit] for unit in units)) for units in stages]
         for _ in range(len(stages) + 1):
             before = list(starts)
-            for one, two, apart in after:
-                starts[two] = max(starts[two], starts[one] + apart)
-            first = next((k for k, own in enumerate(stages) if work.first in own), None)
-            if first is not None and starts[first] > 0:
-                return None
+            for former, later, distance in distances:
+                starts[later] = max(starts[later], starts[former] + distance)
+            for units, start in zip(stages, starts, strict=True):
+                if work.first in units and start > 0:
+                    return None  # the chain begins at 0
             if starts == before:
                 return starts
         return None
 
     def _choose_turns(self, stages: list[list[int]], places_of: list[int]) -> None:
-        """All turns in which the stages of one core may follow each other; the best stays.
+        """Try all turns in which the stages of one core may follow each other; keep the best.
 
         With K turns in between, s_a + W_a + ε + K·CT ≤ s_b and s_b + W_b + ε ≤ s_a + (K + 1)·CT. No
         stage of the shortest cut waits for a cycle or more.
         """
         edges, cycle = self._edges(stages), self.cycle_ns
         pairs = [
-            (one, two)
-            for one, two in combinations(range(len(stages)), 2)
-            if places_of[one] == places_of[two]
+            (former, later)
+            for former, later in combinations(range(len(stages)), 2)
+            if places_of[former] == places_of[later]
         ]
 
         def choose(left: list[tuple[int, int]], turns: list[_Turn]) -> None:
@@ -331,30 +350,31 @@ class _Search:
             starts = self._starts(stages, edges, turns)
             if starts is None or self.steps > 2 * MOST_STEPS:
                 return
-            end = max(s + self.lasting(own) for s, own in zip(starts, stages, strict=True))
+            end = max(
+                start + self.lasting(units) for start, units in zip(starts, stages, strict=True)
+            )
             key = end, len(stages), len(set(places_of))
             if self.best is not None and key >= self.best[0]:
                 return
             if not left:
                 self.best = key, stages, places_of, starts
                 return
-            (one, two), *others = left
+            (former, later), *rest = left
             latest = [start + (len(stages) + 1) * cycle for start in starts]
-            least = (starts[two] - latest[one]) // cycle - 1
-            most = (latest[two] - starts[one]) // cycle + 1
-            ways = sorted(range(least, most + 1), key=abs)
-            for between in ways:
-                choose(others, [*turns, (one, two, between)])
+            least = (starts[later] - latest[former]) // cycle - 1
+            most = (latest[later] - starts[former]) // cycle + 1
+            for between in sorted(range(least, most + 1), key=abs):
+                choose(rest, [*turns, (former, later, between)])
 
         choose(pairs, [])
 
 
 def _acyclic(edges: Sequence[_Turn]) -> bool:
     """Whether no stage waits for another that waits for it."""
-    left = {(one, two) for one, two, _ in edges}
+    left = {(former, later) for former, later, _ in edges}
     while left:
-        waiting = {two for _, two in left}
-        following = {(one, two) for one, two in left if one in waiting}
+        waiting = {later for _, later in left}
+        following = {(former, later) for former, later in left if former in waiting}
         if following == left:
             return False
         left = following
@@ -364,8 +384,9 @@ def _acyclic(edges: Sequence[_Turn]) -> bool:
 def opened_early(
     stages: Sequence[Stage], work: Work, margin_ns: int, cycle_ns: int, room_ns: int = 0
 ) -> tuple[Stage, ...]:
-    """The same stages in slots that open as soon as the first data may come, and close earlier. The
-    last slot leaves ``room_ns`` of its core to the publication, where it can.
+    """Return the stages in slots that open as soon as the first data may come, and close earlier.
+
+    The last slot leaves ``room_ns`` of its core to the publication, where it can.
     """
     opened = list(stages)
     done: dict[int, NDArray[np.int64]] = {}
@@ -373,19 +394,23 @@ def opened_early(
         stage = opened[number]
         took = work.steps_ns[:, list(stage.members)].sum(axis=1)
         inputs = [
-            done[one]
+            done[before]
             for unit in stage.members
-            for one in work.after[unit]
-            if one not in stage.members
+            for before in work.after[unit]
+            if before not in stage.members
         ]
         inputs += [
             np.full(len(took), work.begins_ns[unit])
             for unit in stage.members
             if not work.after[unit]
         ]
-        arrives, first = np.max(inputs, axis=0), min(int(one.min()) for one in inputs)
-        others = [one for one in opened if one is not stage and one.place == stage.place]
-        free = (stage.opens_ns - (stage.opens_ns - one.closes_ns) % cycle_ns for one in others)
+        arrives, first = np.max(inputs, axis=0), min(int(instants.min()) for instants in inputs)
+        # When the slots of its core's other stages close last before this one opened.
+        free = [
+            stage.opens_ns - (stage.opens_ns - beside.closes_ns) % cycle_ns
+            for beside in opened
+            if beside is not stage and beside.place == stage.place
+        ]
         room = room_ns if len(work.after) - 1 in stage.members else 0
         within_a_cycle = int((arrives + took).max()) + margin_ns + room - cycle_ns
         early = min(stage.opens_ns, max(first, within_a_cycle))
@@ -398,21 +423,16 @@ def opened_early(
 
 
 def _in_order(stages: Sequence[Stage], work: Work) -> Iterator[int]:
-    """The places of stages, each behind those that it waits for."""
-    over: set[int] = set()
+    """Yield the numbers of stages, each behind those that it waits for."""
+    over: set[int] = set()  # units
     left = list(range(len(stages)))
     while left:
-        number = next(
-            k
-            for k in left
-            if all(
-                one in over or one in stages[k].members
-                for unit in stages[k].members
-                for one in work.after[unit]
-            )
-        )
+        for number in left:
+            members = {*stages[number].members}
+            if all(before in over | members for unit in members for before in work.after[unit]):
+                break
         left.remove(number)
-        over |= {*stages[number].members}
+        over |= members
         yield number
 
 
@@ -425,16 +445,17 @@ def pipelined(
     *,
     room_ns: int = 0,
 ) -> ChainPlan:
-    """A shaped plan's chain in stages, on these cores (default: those of ``core_of``).
+    """Return a shaped plan with its chain in stages, on these cores (default: of ``core_of``).
 
-    Each slot has ``room_ns`` more, for what may have the core meanwhile: who receives the output.
+    Each slot is ``room_ns`` longer, for what may have the core meanwhile: receivers of the output.
     A core that is named twice has two stages at a time, of which the first has the better priority:
-    right where callbacks wait for something rather than compute. OperationError: no cut fits; the
-    message names what prevents it.
+    that is right where callbacks wait for something rather than compute.
+
+    Raises OperationError: no cut fits; the message names what prevents it.
     """
-    before = list(dict.fromkeys(core_of[node] for own in work.nodes for node in own))
+    before = list(dict.fromkeys(core_of[node] for unit in work.nodes for node in unit))
     # In the order of the chain, so that nodes stay where they are, if that can be.
-    cores = sorted(cores or before, key=lambda one: (*before, one).index(one))
+    cores = sorted(cores or before, key=lambda core: (*before, core).index(core))
     margin, cycle, node = plan.margin.epsilon_ns + room_ns, plan.cycle_ns, plan.shaping_node
     if node is None:
         raise InputError("a pipeline needs a shaping node: plan with --publication synchronous")
@@ -453,8 +474,8 @@ def pipelined(
     for number, stage in enumerate(stages, start=1):
         core, slots = cores[stage.place], in_cycle(stage.opens_ns, stage.closes_ns, cycle)
         urgency = CHAIN_PRIORITY + cores[: stage.place].count(core)
-        own = (node for unit in stage.members for node in work.nodes[unit])
-        servers.append(server_for(own, f"stage{number}", core, urgency, slots))
+        nodes = (name for unit in stage.members for name in work.nodes[unit])
+        servers.append(server_for(nodes, f"stage{number}", core, urgency, slots))
     core, slots = cores[last.place], in_cycle(opens, opens + length, cycle)
     servers.append(server_for([node.thread.node], "output", core, OUTPUT_PRIORITY, slots))
     return revised(
@@ -467,19 +488,23 @@ def pipelined(
 
 
 def stage_places(work: Work, cycle_ns: int, cores: int) -> dict[str, int]:
-    """On which of so many cores to measure nodes: on that of their stage, by the medians, without a
-    margin. Where no cut fits, the fullest stage has as little to do as can be.
+    """Return on which of so many cores to measure each node: on that of its stage.
+
+    The stages are cut by medians, without a margin. Where no cut fits, the fullest stage has as
+    little to do as can be.
     """
     medians = np.median(work.steps_ns, axis=0, keepdims=True).astype(np.int64)
     usual = replace(work, steps_ns=medians)
     cycles = (cycle_ns * tenths // 10 for tenths in count(10))
     tried = (shortest_cut(usual, 0, cycle, cores) for cycle in cycles)
-    stages = next(found for found in tried if found)
-    return {node: one.place for one in stages for unit in one.members for node in work.nodes[unit]}
+    stages = next(cut for cut in tried if cut)
+    return {
+        node: stage.place for stage in stages for unit in stage.members for node in work.nodes[unit]
+    }
 
 
 def _refuse_too_long(work: Work, margin_ns: int, cycle_ns: int) -> None:
-    """What cannot be cut has to fit into a cycle."""
+    """Refuse work of which a unit, which cannot be cut, does not fit into a cycle."""
     for unit, nodes in enumerate(work.nodes):
         longest = work.longest_ns([unit])
         needed = longest + margin_ns
@@ -494,6 +519,7 @@ def _refuse_too_long(work: Work, margin_ns: int, cycle_ns: int) -> None:
 
 
 def _no_room(work: Work, margin_ns: int, cycle_ns: int, cores: Sequence[int]) -> str:
+    """Say that no cut fits on the cores, and what helps."""
     named, total = ",".join(map(str, sorted(cores))), int(work.steps_ns.sum(axis=1).max())
     most = range(len(cores) + 1, len(work.after) + 1)
     enough = next((n for n in most if shortest_cut(work, margin_ns, cycle_ns, n)), None)

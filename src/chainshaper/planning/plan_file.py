@@ -1,4 +1,4 @@
-"""The file of a plan: YAML that a person reads, edits, and gets back as it was written.
+"""The file of a plan: YAML that a person reads and edits.
 
 A file has a list of chains. Each server is written out in the first chain that has it; further
 chains have its name in its place.
@@ -27,9 +27,15 @@ _HEADER = """\
 # slots are half-open, [start, end), and count from the start of a cycle.
 """
 
-_UNLESS_OTHERWISE = {"offset_ns", "into_open_slot", "shaping_thread", "equal_priorities"}
-_UNLESS_OTHERWISE |= {"slot_ends"}
-_UNLESS_OTHERWISE |= {"further_shaping_nodes"}  # these are not written while they are as usual
+# Fields that are not written while they have their default.
+_NOT_WRITTEN = {
+    "offset_ns",
+    "into_open_slot",
+    "shaping_thread",
+    "equal_priorities",
+    "slot_ends",
+    "further_shaping_nodes",
+}
 _SECTION_COMMENTS = {
     "evidence": "the measurements behind the plan",
     "margin": "epsilon: how far the chain's slot reaches beyond the longest latency measured",
@@ -56,18 +62,18 @@ _SECTION_COMMENTS = {
 
 
 def load_plan(path: str | Path) -> Plan:
-    """Read a plan, however a person has laid it out. Raises: as :func:`.read_model`."""
+    """Read a plan from its file. Raises: as :func:`.read_model`."""
     return read_model(path, Plan, made_by="written by `chainshaper plan`")
 
 
 class _EarlierPlan(ChainPlan):
-    """A plan as files of earlier versions have it: that of one chain."""
+    """A plan as files of earlier versions have it: of one chain."""
 
     format: Literal[1] = 1
 
 
 def convert_plan(path: str | Path) -> Plan:
-    """Read the plan of an earlier version. Raises: as :func:`.read_model`."""
+    """Read a plan from a file of an earlier version. Raises: as :func:`.read_model`."""
     made_by = "that `chainshaper plan` of an earlier version wrote"
     return _of_earlier(read_model(path, _EarlierPlan, made_by=made_by))
 
@@ -77,10 +83,10 @@ def _of_earlier(plan: _EarlierPlan) -> Plan:
 
 
 def dump_plan(plan: Plan) -> str:
-    """The YAML text of a plan, each server written once; reading it gives an equal plan."""
+    """Return the YAML text of a plan, each server written once; reading it gives an equal plan."""
     text, known = f"{_HEADER}format: 2\nchains:\n", set[str]()
-    for chain in plan.chains:
-        values = _yaml_values(chain)
+    for chain_plan in plan.chains:
+        values = _yaml_values(chain_plan)
         names = [server["name"] for server in values["servers"]]
         pairs = zip(names, values["servers"], strict=True)
         values["servers"] = [name if name in known else server for name, server in pairs]
@@ -89,24 +95,32 @@ def dump_plan(plan: Plan) -> str:
     return text
 
 
-def _yaml_values(plan: ChainPlan) -> dict[str, Any]:
-    names = _UNLESS_OTHERWISE if plan.shaping_node else {*_UNLESS_OTHERWISE, "fallback"}
-    usual = {name for name in names if getattr(plan, name) == ChainPlan.model_fields[name].default}
-    how: dict[str, Any] = {"mode": "json", "by_alias": True, "context": AS_YAML}
-    values = plan.model_dump(exclude_none=True, exclude=usual, **how)
+def _yaml_values(chain_plan: ChainPlan) -> dict[str, Any]:
+    """Return the plan of a chain as it is written: without fields that say nothing."""
+    not_written = {*_NOT_WRITTEN}
+    if chain_plan.shaping_node is None:
+        not_written.add("fallback")
+    fields = ChainPlan.model_fields
+    defaults = {name for name in not_written if getattr(chain_plan, name) == fields[name].default}
+    values = chain_plan.model_dump(
+        mode="json", by_alias=True, exclude_none=True, exclude=defaults, context=AS_YAML
+    )
     for server in values["servers"]:
-        threads = ({key: own for key, own in one.items() if own} for one in server["threads"])
-        server["threads"] = [_OnOneLine(thread) for thread in threads]
+        server["threads"] = [
+            _OnOneLine({key: value for key, value in thread.items() if value})
+            for thread in server["threads"]
+        ]
         if not server["best_effort"]:
             del server["best_effort"]
     if "receivers" in values["predicted"]:
-        del values["predicted"]["receivers"]["shares"]  # of no bands
+        del values["predicted"]["receivers"]["shares"]  # receivers have no bands
     if "modes" in values:
         values["modes"]["bands"] = _OnOneLine(values["modes"]["bands"])
     return values
 
 
 def _sections(values: dict[str, Any]) -> str:
+    """Return the fields of a chain's plan as YAML, with their comments."""
     text = ""
     for key, value in values.items():
         if key in _SECTION_COMMENTS:
@@ -123,8 +137,8 @@ class _Dumper(yaml.SafeDumper):
     """Sequences stand on one line, unless there are mappings in them."""
 
     def represent_sequence(self, tag: str, sequence: Any, flow_style: bool | None = None) -> Any:
-        flow = flow_style or not any(isinstance(one, dict) for one in sequence)
-        return super().represent_sequence(tag, sequence, flow)
+        on_one_line = flow_style or not any(isinstance(item, dict) for item in sequence)
+        return super().represent_sequence(tag, sequence, on_one_line)
 
 
 _Dumper.add_representer(
@@ -135,8 +149,8 @@ _Dumper.add_representer(
 def save_plan(plan: Plan, path: str | Path, *, overwrite: bool = False) -> None:
     """Write a plan, whole or not at all.
 
-    Raises InputError: ``path`` exists (and ``overwrite`` is not set), or its folder does not.
-    OperationError: it cannot be written; nothing is left behind, an existing file stays.
+    Raises InputError: ``path`` exists (and ``overwrite`` is not set), or its folder does not exist.
+    OperationError: the file cannot be written; nothing is left behind, an existing file stays.
     """
     path = Path(path)
     if not (overwrite and path.is_file()):
@@ -145,7 +159,7 @@ def save_plan(plan: Plan, path: str | Path, *, overwrite: bool = False) -> None:
 
 
 def save_plans(chains: Sequence[ChainPlan], folder: str | Path) -> list[Path]:
-    """Write a plan of each chain into a new folder, named after the chain's output; all or none.
+    """Write the plan of each chain into a new folder, named after its output; all or none.
 
     Raises: as :func:`save_plan`.
     """
@@ -156,32 +170,33 @@ def save_plans(chains: Sequence[ChainPlan], folder: str | Path) -> list[Path]:
         raise OperationError(f"{folder}: the folder cannot be made: {error}") from error
     written: list[Path] = []
     try:
-        for number, chain in enumerate(chains, start=1):
-            name = (chain.chain.output or "plan").strip("/").replace("/", "_")
+        for number, chain_plan in enumerate(chains, start=1):
+            name = (chain_plan.chain.output or "plan").strip("/").replace("/", "_")
             written.append(folder / f"{number}_{name}.yaml")
-            save_plan(Plan.of(chain), written[-1])
+            save_plan(Plan.of(chain_plan), written[-1])
     except OperationError:
         rmtree(folder)
         raise
     return written
 
 
-def plan_json(plan: ChainPlan) -> dict[str, Any]:
-    """The plan as plain data for ``--json``: integer nanoseconds, keys ending in ``_ns``, with the
-    ends of the publish slots (``bands_ns``), :func:`band_predictions`, and what will be seen
-    (``expected``: :class:`~chainshaper.planning.overruns.Expected`).
+def plan_json(chain_plan: ChainPlan) -> dict[str, Any]:
+    """Return the plan of a chain as plain data for ``--json``: integers in ns, keys end in ``_ns``.
+
+    Besides the plan it has the ends of the publish slots (``bands_ns``), :func:`band_predictions`,
+    and what will be seen (``expected``: :class:`~chainshaper.planning.overruns.Expected`).
     """
-    seen = expected(plan)
+    seen = expected(chain_plan)
     return {
-        **plan.model_dump(mode="json"),
+        **chain_plan.model_dump(mode="json"),
         "expected": None if seen is None else {**seen._asdict(), "leave_ns": list(seen.leave_ns)},
-        "bands_ns": [end for _, end in publish_slots(plan)],
-        "predicted_bands": [band._asdict() for band in band_predictions(plan)],
+        "bands_ns": [end for _, end in publish_slots(chain_plan)],
+        "predicted_bands": [band._asdict() for band in band_predictions(chain_plan)],
     }
 
 
 def plan_in(values: Mapping[str, Any], where: object = "the plan") -> Plan:
-    """The plan in the plain data of a recording or a run, which may be of an earlier version.
+    """Return the plan from the plain data of a recording or a run, also of an earlier version.
 
     Raises InputError, which begins with ``where``: the values are no plan.
     """
@@ -192,5 +207,5 @@ def plan_in(values: Mapping[str, Any], where: object = "the plan") -> Plan:
 
 
 def plan_values(plan: Plan) -> dict[str, Any]:
-    """A plan as plain data for a recording or a run, as :func:`plan_in` reads it."""
+    """Return a plan as plain data for a recording or a run, as :func:`plan_in` reads it."""
     return plan.model_dump(mode="json")

@@ -1,26 +1,28 @@
 """What was measured of a chain, and how long others can have its core while all of them run.
 
-While a recording is made every chain runs, at one priority, in whatever order messages come. So
-what one instance took is an accident. Planned together, each chain's latencies are what it takes
-*alone* (its callbacks, without the time for which the others had its core), and to these is added
-the longest time for which the others can have it (Joseph and Pandya, The Computer Journal 29,
-1986):
+While a recording is made, every chain runs, at one priority, in whatever order messages come. So
+the latency of an instance depends on which others happened to run. For a plan of several chains,
+the latency of each is what it takes *alone* (its callbacks, without the time for which the others
+had its core), and the longest time for which the others can have it (Joseph and Pandya, The
+Computer Journal 29, 1986):
 
     R = L + Σ ⌈(R + J) / T⌉ · C,
 
-over all that may run before the chain on its cores, each every T, for C at most, and up to J later
-in one cycle than in another: the branches that begin with it, in any order, behind the fork; chains
-of a better priority, where they run at the same time; the shaping nodes of all other chains, which
-take a message when it comes, and later watch the clock before a slot and publish.
+The sum is over all that may run before the chain on its cores, each every T, for C at most, and up
+to J later in one cycle than in another:
 
-The longest latency, and the last slot with it, is behind all of it; bands before that are placed by
-what was measured, as far as it is in between.
+* the branches that begin with the chain, in any order, behind the fork;
+* chains of a better priority, where they run at the same time;
+* the shaping nodes of all other chains, which take a message when it comes, and later watch the
+  clock before a slot and publish.
+
+The longest latency, and with it the last slot, is behind all of this delay. Bands before the last
+are placed by what was measured, as far as it lies between the two.
 """
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain as joined
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -36,43 +38,37 @@ from chainshaper.values.plan_choices import Wishes
 
 _Stage: TypeAlias = tuple[str, str | None]
 """A callback of a graph, by its node and what it publishes."""
-UNKNOWN = -1  # of a duration that a recording does not tell
-START_UP_NS = 3_000_000_000  # in so long an application starts, or ends
-APART = 1.3  # so many times as long as others is no part of their tail
-FEWEST = 20  # cycles, to tell one from the others
+UNKNOWN = -1  # a duration that a recording does not tell
+START_UP_NS = 3_000_000_000  # an application takes so long to start, or to end
+APART = 1.3  # latencies so many times as long as the next longest are no part of the same tail
+FEWEST = 20  # cycles: with fewer, none can be told apart from the others
 MOST_ROUNDS = 20  # until the chains' delays, which depend on each other, stay as they are
-# A gate wakes up for a message, takes it, wakes up again behind its pause, and takes notes: so long
-# in the simulator (docs/simulator.md), and less in a live one, beside watching and publishing.
+# A gate wakes up for a message, takes it, wakes up again behind its pause, and logs: that takes so
+# long in the simulator (docs/simulator.md), and less in a live one, beside watching and publishing.
 GATE_TAKES_NS = 400_000
-OFTEN = 0.05  # of a chain's cycles: so often a callback of others on its threads is worth a note
+OFTEN = 0.05  # a callback of others that runs on a chain's threads in more cycles is worth a note
 
 
 class Interfering(NamedTuple):
-    """A callback that is not part of a chain, on a thread that is; ``origins`` are the nodes that
-    trigger it. It ran in this ``share`` of the chain's cycles, for ``longest_ns`` at most.
-    """
+    """A callback that is not part of a chain, and runs on one of the chain's threads."""
 
     label: str
-    origins: tuple[str, ...]
-    share: float
-    longest_ns: int
+    origins: tuple[str, ...]  # the nodes that trigger it
+    share: float  # of the chain's cycles in which it ran
+    longest_ns: int  # how long it ran, at most
 
 
 class Reception(NamedTuple):
-    """How an output gets to those that receive it (ns).
+    """How an output gets to the nodes that receive it (times in ns)."""
 
-    ``core`` is theirs (None: several, or not known). A message is on its way for ``shortest_ns`` to
-    ``longest_ns``, without the time for which others had that core. Its callbacks take ``time_ns``
-    at most, and others of their executors ``beside_ns`` in a cycle; ``beside_once_ns`` is the
-    sum of the longest execution of each other callback, for which an output may have to wait.
-    """
-
-    core: int | None
+    core: int | None  # of the receivers; None: several, or not known
+    # How long a message is on its way, without the time for which others had that core.
     shortest_ns: int
     mean_ns: int
     longest_ns: int
-    time_ns: int
-    beside_ns: int = 0
+    time_ns: int  # how long the callbacks that receive it take, at most
+    beside_ns: int = 0  # how long other callbacks of their executors take in a cycle, at most
+    # The sum of the longest execution of each such callback: an output may have to wait for it.
     beside_once_ns: int = 0
 
 
@@ -164,7 +160,7 @@ class Profile:
 
     @property
     def name(self) -> str:
-        """What the chain is called in messages."""
+        """The name of the chain in messages."""
         return self.spec or "..".join(self.topics)
 
     @property
@@ -195,72 +191,82 @@ class Profile:
         given = self.starts_ns
         return np.arange(len(self.latencies_ns)) * self.period_ns if given is None else given
 
-    def chosen(self, these: NDArray[np.bool_]) -> "Profile":
-        """The profile with the longest latency of these cycles; the others stay in ``every``."""
-        steps = self.steps_ns[these] if len(self.steps_ns) == len(these) else self.steps_ns
-        of_graph = self.graph_steps_ns
+    def chosen(self, cycles: NDArray[np.bool_]) -> "Profile":
+        """Return the profile with the latencies of these cycles; all of them stay in ``every``."""
+        steps, graph_steps = self.steps_ns, self.graph_steps_ns
         return replace(
             self,
-            graph_steps_ns=of_graph[these] if len(of_graph) == len(these) else of_graph,
-            latencies_ns=self.latencies_ns[these],
-            starts_ns=self.starts[these],
-            measured_ns=None if self.measured_ns is None else self.measured_ns[these],
-            steps_ns=steps,
+            latencies_ns=self.latencies_ns[cycles],
+            starts_ns=self.starts[cycles],
+            measured_ns=None if self.measured_ns is None else self.measured_ns[cycles],
+            steps_ns=steps[cycles] if len(steps) == len(cycles) else steps,
+            graph_steps_ns=graph_steps[cycles] if len(graph_steps) == len(cycles) else graph_steps,
             every_latency_ns=self.every,
         )
 
 
 def up_to(profile: Profile, percentile: float) -> Profile:
-    """The profile up to a percentile of its latencies: what takes longer is taken to be late."""
+    """Return the profile up to a percentile of its latencies; longer ones are taken to be late."""
     if not 0 < percentile <= 100:
         raise InputError(f"--percentile {percentile:g}: write more than 0, at most 100")
     latencies = check_latencies(profile.latencies_ns)
-    fit = max(2, math.ceil(percentile / 100 * latencies.size - 1e-6))
-    of_modes = {mode: up_to(one, percentile) for mode, one in profile.of_modes.items()}
-    return replace(profile.chosen(latencies <= np.sort(latencies)[fit - 1]), of_modes=of_modes)
+    count = max(2, math.ceil(percentile / 100 * latencies.size - 1e-6))
+    shorter = profile.chosen(latencies <= np.sort(latencies)[count - 1])
+    of_modes = {mode: up_to(of_mode, percentile) for mode, of_mode in profile.of_modes.items()}
+    return replace(shorter, of_modes=of_modes)
 
 
 def doubts_about(profile: Profile) -> list[str]:
-    """What else than the chain decides its latencies, and what in the evidence contradicts itself,
-    one sentence each."""
+    """Say what beside the chain decides its latencies, and what contradicts itself in the evidence.
+
+    Each doubt is a sentence.
+    """
     doubts = (other_beginnings(profile), interfering_callback(profile), *profile.contradictions)
     return [*filter(None, doubts)]
 
 
 def other_beginnings(profile: Profile) -> str | None:
-    """Which nodes begin what the chain waits for, beside its first callback; None: no others."""
+    """Say which nodes beside the chain's first begin what the chain waits for; None: no others."""
     first = (*profile.nodes[:1], *profile.topics[:1])
-    begin = dict.fromkeys(one.node for one in profile.callbacks if not one.after)
-    own = {one.node for one in profile.callbacks if (one.node, one.publishes) == first}
-    if not own or not (others := [node for node in begin if node not in own]):
+    begin = dict.fromkeys(callback.node for callback in profile.callbacks if not callback.after)
+    of_chain = {
+        callback.node
+        for callback in profile.callbacks
+        if (callback.node, callback.publishes) == first
+    }
+    beside = [node for node in begin if node not in of_chain]
+    if not of_chain or not beside:
         return None
-    begin_apart = ", ".join((profile.nodes[0], *others[:-1]))
+    begin_apart = ", ".join((profile.nodes[0], *beside[:-1]))
     return (
-        f"{begin_apart} and {others[-1]} start at a new offset to each other at each launch, which"
+        f"{begin_apart} and {beside[-1]} start at a new offset to each other at each launch, which"
         f" changes the latency of {profile.name}. Record several launches, or use --adapt"
     )
 
 
 def interfering_callback(profile: Profile) -> str | None:
-    """Which callback that is not part of a chain delays it most on its own threads, and what keeps
-    it away; None: none does in more than :data:`OFTEN` of its cycles.
+    """Say which callback beside a chain delays it most on the chain's threads, and what helps.
+
+    None: none does in more than :data:`OFTEN` of the chain's cycles.
     """
-    often = [one for one in profile.interfering if one.share > OFTEN]
+    often = [callback for callback in profile.interfering if callback.share > OFTEN]
     if not often:
         return None
-    worst = max(often, key=lambda one: one.share * one.longest_ns)
+    worst = max(often, key=lambda callback: callback.share * callback.longest_ns)
     remedy = "give it a callback group and an executor of its own"
     if worst.origins and not set(worst.origins) & {*profile.core_of}:
         nodes = " and ".join(f"--best-effort {node}" for node in worst.origins)
         remedy = f"with {nodes} what triggers it runs only when the chain does not"
-    said = f"{profile.name}: in {worst.share:.0%} of its cycles one of its threads also runs"
-    said += f" {worst.label}, which is not part of it, for up to"
-    return f"{said} {milliseconds(worst.longest_ns, 1)} ms: {remedy}"
+    doubt = f"{profile.name}: in {worst.share:.0%} of its cycles one of its threads also runs"
+    doubt += f" {worst.label}, which is not part of it, for up to"
+    return f"{doubt} {milliseconds(worst.longest_ns, 1)} ms: {remedy}"
 
 
 def deciding_cycles(profile: Profile) -> str | None:
-    """Which few cycles, 1 % at most and :data:`APART` times as long as the next longest, decide the
-    longest latency, the likely cause, and what leaves them out.
+    """Say which few cycles decide the longest latency, the likely cause, and what leaves them out.
+
+    They are 1 % of all at most, and :data:`APART` times as long as the next longest. None: no such
+    cycles are there.
     """
     latencies, starts = profile.latencies_ns, profile.starts
     order = np.argsort(latencies, kind="stable")[::-1]
@@ -288,30 +294,35 @@ def deciding_cycles(profile: Profile) -> str | None:
         cause = "the application's own" if watched else "a stall of the machine (not watched)"
         remedy = f"--percentile {math.floor(1000 * (1 - number / latencies.size)) / 10:g}"
     cycles = ", ".join(f"{start / 1e9:.1f} s" for start in starts[few[:3]])
-    longest, beyond = milliseconds(int(latencies[few[0]]), 1), milliseconds(next_longest, 1)
-    said = f"{number} of {latencies.size} cycles decide{'s' * (number == 1)} the longest latency,"
-    said += f" at {cycles}{', …' * (number > 3)}: {longest} ms{where}; the next longest takes"
-    return f"{said} {beyond} ms. Likely {cause}: leave it out with {remedy}"
+    if number > 3:
+        cycles += ", …"
+    longest, shorter = milliseconds(int(latencies[few[0]]), 1), milliseconds(next_longest, 1)
+    verb = "decides" if number == 1 else "decide"
+    doubt = f"{number} of {latencies.size} cycles {verb} the longest latency,"
+    doubt += f" at {cycles}: {longest} ms{where}; the next longest takes"
+    return f"{doubt} {shorter} ms. Likely {cause}: leave it out with {remedy}"
 
 
 class Rival(NamedTuple):
-    """What runs before a chain: every ``period_ns`` for ``cost_ns``, up to ``jitter_ns`` later."""
+    """Something that runs before a chain on its cores (T, C and J above)."""
 
-    period_ns: int
-    cost_ns: int
-    jitter_ns: int = 0
+    period_ns: int  # so often it runs
+    cost_ns: int  # so long, at most
+    jitter_ns: int = 0  # so much later in one cycle than in another, at most
 
 
-def interference(own_ns: int, rivals: Sequence[Rival], limit_ns: int) -> int:
-    """How long rivals can delay what takes ``own_ns`` alone, as far as ``limit_ns`` (ns).
+def interference(alone_ns: int, rivals: Sequence[Rival], limit_ns: int) -> int:
+    """Return how long (ns) rivals can delay what takes ``alone_ns``, as far as ``limit_ns``.
 
-    >>> interference(5, [Rival(10, 2), Rival(7, 1)], 100)  # both once more in 5 + 2 + 1 > 7
+    >>> interference(5, [Rival(10, 2), Rival(7, 1)], 100)  # the second runs twice in 5 + 2 + 1 > 7
     4
     """
     delay = 0
-    while own_ns + delay < limit_ns:
-        busy = own_ns + delay
-        longer = sum(-(-(busy + one.jitter_ns) // one.period_ns) * one.cost_ns for one in rivals)
+    while alone_ns + delay < limit_ns:
+        busy = alone_ns + delay
+        longer = sum(
+            -(-(busy + rival.jitter_ns) // rival.period_ns) * rival.cost_ns for rival in rivals
+        )
         if longer == delay:
             break
         delay = longer
@@ -326,19 +337,20 @@ def with_interference(
     at_once: bool,
     shifting: bool = False,
 ) -> list[Profile]:
-    """The profiles with the latencies that the chains can have while all of them run.
+    """Return the profiles with the latencies that the chains can have while all of them run.
 
     ``groups`` are the places of chains that begin together. With ``at_once`` groups do not take
-    turns: those of a shorter period run at a better priority, and, with ``shifting``, one may have
-    to wait before it takes its stamp, from which its slots count. Where every callback has slots of
-    its own nothing is added to the latency: ``others_ns`` is what each slot has to have room for.
+    turns: those of a shorter period run at a better priority. With ``shifting`` one of a worse
+    priority may have to wait before it takes its stamp, from which its slots count. Where every
+    callback has slots of its own, nothing is added to the latency: each slot has to have room for
+    ``others_ns``.
     """
     if len(profiles) == 1:
         return list(profiles)
     if wishes.policy in PER_CALLBACK:
         return [
-            replace(one, others_ns=_of_gates_beside(k, profiles, wishes))
-            for k, one in enumerate(profiles)
+            replace(profile, others_ns=_of_gates_beside(place, profiles, wishes))
+            for place, profile in enumerate(profiles)
         ]
     undelayed = [alone(profile) for profile in profiles]
     delays = [0] * len(profiles)
@@ -351,16 +363,16 @@ def with_interference(
     return list(map(_later, undelayed, delays, measured))
 
 
-def _of_gates_beside(k: int, profiles: Sequence[Profile], wishes: Wishes) -> int:
-    """For how long the gates of other chains may have the cores of a chain in one of its cycles."""
+def _of_gates_beside(place: int, profiles: Sequence[Profile], wishes: Wishes) -> int:
+    """Return how long gates of other chains may have the cores of a chain in one of its cycles."""
     if wishes.policy in UNSHAPED or wishes.publication == "asynchronous":
         return 0
-    own, cores = profiles[k], {*profiles[k].core_of.values()}
+    profile, cores = profiles[place], {*profiles[place].core_of.values()}
     return sum(
-        (1 + -(-own.period_ns // one.period_ns)) * one.cost_ns
-        for place, other in enumerate(profiles)
-        if place != k and other.core_of.get(other.last or "") in cores
-        for one in _of_gate(other, wishes, 0, False)
+        (1 + -(-profile.period_ns // rival.period_ns)) * rival.cost_ns
+        for place_beside, beside in enumerate(profiles)
+        if place_beside != place and beside.core_of.get(beside.last or "") in cores
+        for rival in _of_gate(beside, wishes, 0, False)
     )
 
 
@@ -371,64 +383,74 @@ def _delays(
     before_ns: Sequence[int],
     together: tuple[bool, bool],
 ) -> list[int]:
-    """How long each chain may be delayed, where the others come up to ``before_ns`` later, by
-    whether they run at once, and stamps shift.
+    """Return how long each chain may be delayed, where the others come up to ``before_ns`` later.
+
+    ``together``: whether groups run at once, and whether their stamps shift.
     """
     at_once, shifting = together
     delays, better = [0] * len(profiles), list[Sequence[int]]()
     gates = wishes.policy not in UNSHAPED and wishes.publication != "asynchronous"
-    for group in sorted(groups, key=lambda one: (profiles[one[0]].period_ns, one[0])):
-        for k in group:
-            one, siblings = profiles[k], [profiles[j] for j in group if j != k]
-            forked = {*_stages([one])} - {*_stages(siblings)}  # none of these before the fork
-            rivals = [Rival(one.period_ns, _demand(one, siblings, forked))]
-            for places in better if at_once else ():  # what waits elsewhere comes late
-                chains = [profiles[j] for j in places]
-                cost = _demand(one, chains, _stages([one]))
-                latest = max(_longest_in_time(profiles[j], delays[j]) for j in places)
+    for group in sorted(groups, key=lambda places: (profiles[places[0]].period_ns, places[0])):
+        for place in group:
+            profile = profiles[place]
+            siblings = [profiles[sibling] for sibling in group if sibling != place]
+            # Before the fork, siblings are the same callbacks, and delay nothing.
+            forked = {*_stages([profile])} - {*_stages(siblings)}
+            rivals = [Rival(profile.period_ns, _demand(profile, siblings, forked))]
+            for better_group in better if at_once else ():
+                chains = [profiles[above] for above in better_group]
+                cost = _demand(profile, chains, _stages([profile]))
+                # A callback that waits for others elsewhere may come late.
+                latest = max(
+                    _longest_in_time(profiles[above], delays[above]) for above in better_group
+                )
                 rivals.append(Rival(chains[0].period_ns, cost, max(0, latest - cost)))
-            for place, other in enumerate(profiles):
-                cores = _cores(one, forked if place in group else _stages([one]))
-                if gates and place != k and other.core_of.get(other.last or "") in cores:
-                    rivals += _of_gate(other, wishes, before_ns[place], shifting)
-                    rivals += _of_receivers(other, profiles, before_ns[place])
-            delays[k] = interference(_longest_in_time(one), rivals, one.period_ns)
+            for place_beside, beside in enumerate(profiles):
+                cores = _cores(profile, forked if place_beside in group else _stages([profile]))
+                is_beside = place_beside != place and beside.core_of.get(beside.last or "") in cores
+                if gates and is_beside:
+                    rivals += _of_gate(beside, wishes, before_ns[place_beside], shifting)
+                    rivals += _of_receivers(beside, profiles, before_ns[place_beside])
+            delays[place] = interference(_longest_in_time(profile), rivals, profile.period_ns)
         better.append(group)
     return delays
 
 
-def _of_gate(other: Profile, wishes: Wishes, delay_ns: int, shifting: bool) -> Iterator[Rival]:
-    """For how long the gate of another chain, which may be delayed by so much, has its core: for
-    each message when it comes, and when it leaves.
+def _of_gate(profile: Profile, wishes: Wishes, delay_ns: int, shifting: bool) -> Iterator[Rival]:
+    """Yield how long the gate of a chain has its core: when a message comes, and when it leaves.
+
+    The chain may be delayed by ``delay_ns``.
     """
-    apart = max(0, _longest_in_time(other) - int(other.every.min()))
-    yield Rival(other.period_ns, GATE_TAKES_NS, apart + delay_ns)
-    longest = other.longest_publication_ns
+    apart = max(0, _longest_in_time(profile) - int(profile.every.min()))
+    yield Rival(profile.period_ns, GATE_TAKES_NS, apart + delay_ns)
+    longest = profile.longest_publication_ns
     cost = wishes.spin_ns + (SHORTEST_SLOT_NS if longest is None else longest)
     shift = delay_ns if shifting and wishes.anchor == "stamp" else 0
-    yield Rival(other.period_ns, cost, shift + (0 if wishes.bands == 1 else apart + delay_ns))
+    yield Rival(profile.period_ns, cost, shift + (0 if wishes.bands == 1 else apart + delay_ns))
 
 
-def _of_receivers(other: Profile, profiles: Sequence[Profile], delay_ns: int) -> Iterator[Rival]:
-    """For how long those have the core that receive another chain's output, if they are on it."""
-    one = other.reception
-    if one is not None and one.core in (None, *planned_cores(profiles)):
-        apart = max(0, _longest_in_time(other) - int(other.every.min()))
-        yield Rival(other.period_ns, one.time_ns + one.beside_ns, apart + delay_ns)
+def _of_receivers(profile: Profile, profiles: Sequence[Profile], delay_ns: int) -> Iterator[Rival]:
+    """Yield how long receivers of a chain's output have its core, if they are on it."""
+    reception = profile.reception
+    if reception is not None and reception.core in (None, *planned_cores(profiles)):
+        apart = max(0, _longest_in_time(profile) - int(profile.every.min()))
+        cost = reception.time_ns + reception.beside_ns
+        yield Rival(profile.period_ns, cost, apart + delay_ns)
 
 
 def planned_cores(profiles: Sequence[Profile]) -> set[int]:
-    """The cores on which servers run these chains."""
-    return {core for one in profiles for core in one.core_of.values()}
+    """Return the cores on which servers run these chains."""
+    return {core for profile in profiles for core in profile.core_of.values()}
 
 
 def alone(profile: Profile) -> Profile:
-    """The profile with what its callbacks took when nothing else ran; bare latencies as they are.
+    """Return the profile with what its callbacks took as if nothing else ran.
 
-    That is their sum, or, where branches join, the longest way through them, with what branches
-    that share a core with it run on that core: a callback of another chain that delayed this one
-    while it would have waited for its branch anyway has cost it nothing. Where a branch begins by
-    itself, at any time, nothing says what it would have waited for: then what was measured stands.
+    That is their sum, or, where branches join, the longest way through them. On a core that
+    branches share with this way, what they run there is added. A callback of another chain that
+    delayed this one while it would have waited for its branch anyway has cost it nothing. Where a
+    branch begins by itself, at any time, nothing says what the chain would have waited for: then
+    the latencies stay as they were measured. So do bare latencies.
     """
     if not profile.steps_ns.size or UNKNOWN in profile.begins_ns:
         return profile
@@ -438,14 +460,14 @@ def alone(profile: Profile) -> Profile:
         every_latency_ns=_without_others(
             profile, profile.every_step_ns, profile.every_graph_step_ns
         ),
-        of_modes={mode: alone(one) for mode, one in profile.of_modes.items()},
+        of_modes={mode: alone(of_mode) for mode, of_mode in profile.of_modes.items()},
     )
 
 
 def _without_others(
     profile: Profile, steps_ns: NDArray[np.int64], graph_steps_ns: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """When the output is done in each cycle, from what each callback took (a row per cycle)."""
+    """Return when the output is done in each cycle, from what each callback took (a row each)."""
     if graph_steps_ns.size:
         after = [callback.after for callback in profile.callbacks]
         cores = [callback.core for callback in profile.callbacks]
@@ -455,36 +477,48 @@ def _without_others(
 
 
 def _later(profile: Profile, delay_ns: int, measured_ns: NDArray[np.int64]) -> Profile:
-    of_modes = profile.of_modes.items()
+    """Return the profile with all latencies so much later."""
     return replace(
         profile,
         latencies_ns=profile.latencies_ns + delay_ns,
         every_latency_ns=profile.every + delay_ns,
         measured_ns=np.clip(measured_ns, profile.latencies_ns, profile.latencies_ns + delay_ns),
         interference_ns=delay_ns,
-        of_modes={mode: _later(one, delay_ns, one.latencies_ns) for mode, one in of_modes},
+        of_modes={
+            mode: _later(of_mode, delay_ns, of_mode.latencies_ns)
+            for mode, of_mode in profile.of_modes.items()
+        },
     )
 
 
 def _longest_in_time(profile: Profile, delay_ns: int = 0) -> int:
-    """The longest of all cycles that fit into the period when all are so much later: one that does
-    not is late anyway.
+    """Return the longest latency of all cycles that fit into the period if all are so much later.
+
+    A cycle that does not fit is late anyway.
     """
     every = profile.every + delay_ns
     return int(every[every < profile.period_ns].max(initial=0))
 
 
 def _stages(profiles: Sequence[Profile]) -> dict[_Stage, CallbackTimes]:
-    callbacks = joined.from_iterable(profile.callbacks for profile in profiles)
-    return {(one.node, one.publishes): one for one in callbacks}
+    """Return the callbacks of chains, each once."""
+    return {
+        (callback.node, callback.publishes): callback
+        for profile in profiles
+        for callback in profile.callbacks
+    }
 
 
 def _cores(profile: Profile, stages: Collection[_Stage]) -> set[int]:
-    return {one.core for stage, one in _stages([profile]).items() if stage in stages}
+    """Return the cores of these stages of a chain."""
+    return {callback.core for stage, callback in _stages([profile]).items() if stage in stages}
 
 
-def _demand(profile: Profile, others: Sequence[Profile], stages: Collection[_Stage]) -> int:
-    """For how long callbacks of others have, in one cycle, the cores of these stages of a chain."""
-    own, cores = _stages([profile]), _cores(profile, stages)
-    theirs = (one for stage, one in _stages(others).items() if stage not in own)
-    return sum(one.max_response_ns for one in theirs if one.core in cores)
+def _demand(profile: Profile, beside: Sequence[Profile], stages: Collection[_Stage]) -> int:
+    """Return how long callbacks of chains beside it have the cores of these stages in a cycle."""
+    of_chain, cores = _stages([profile]), _cores(profile, stages)
+    return sum(
+        callback.max_response_ns
+        for stage, callback in _stages(beside).items()
+        if stage not in of_chain and callback.core in cores
+    )

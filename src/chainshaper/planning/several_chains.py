@@ -1,10 +1,10 @@
 """From the profiles of several chains to one plan of their application.
 
-Each chain is planned as if it were alone (:func:`~chainshaper.planning.request.plan_chain`), and
-what they share is then made one: chains that begin at the same callback, branches of one graph,
-share the servers that run it, which stay open for the slowest of them; each has its output in slots
-of its own. Chains of different beginnings take turns on the threads of nodes that they share, and
-on cores, or run there at priorities of their own
+Each chain is planned as if it were alone (:func:`~chainshaper.planning.request.plan_chain`). Then
+the plans are joined. Chains that begin at the same callback are branches of one graph: they share
+the servers that run it, which stay open for the slowest chain, and each output has slots of its
+own. Chains of different beginnings take turns on the threads of nodes that they share, and on
+cores, or run there at priorities of their own
 (:func:`~chainshaper.planning.offsets.place_chains`).
 """
 
@@ -48,7 +48,7 @@ from chainshaper.values.errors import InputError, OperationError
 
 _STANDARD = PlanRequest()
 _SHARING = ("shaped", "one-long-slot")
-_MARGIN_STEP_NS = 100_000  # of a smaller margin that is tried
+_MARGIN_STEP_NS = 100_000  # smaller margins that are tried are multiples of it
 
 
 def plan_application(
@@ -57,9 +57,9 @@ def plan_application(
     *,
     time_limit_s: float = TIME_LIMIT_SECONDS,
 ) -> tuple[Plan, list[str]]:
-    """One plan for several chains of an application, and what is to be known about it.
+    """Plan several chains of an application; return the plan, and remarks about it.
 
-    A chain that is added to others moves their outputs by what it can delay them, once.
+    The outputs of each chain move by what the others can delay it.
 
     Raises: as :func:`.plan_chain` and :func:`.place_chains`; OperationError names what would fit.
     """
@@ -68,12 +68,13 @@ def plan_application(
     refuse_entangled(profiles, request.policy)
     refuse_simulated(profiles, request)
     if not keeps_places(request):
-        profiles = [without_reception(one) for one in profiles]
+        profiles = [without_reception(profile) for profile in profiles]
     try:
         return _on_wished_cores(profiles, request, time_limit_s)
     except OperationError as error:
-        if any(one.reception for one in profiles):  # there may be room for the chains alone
-            alone = [without_reception(one) for one in profiles]
+        if any(profile.reception for profile in profiles):
+            # There may be room for the chains without their receivers.
+            alone = [without_reception(profile) for profile in profiles]
             return plan_application(alone, request, time_limit_s=time_limit_s)
         fits = list(_fitting(profiles, request, time_limit_s)) if len(profiles) > 1 else []
         if not fits:
@@ -85,104 +86,125 @@ def plan_application(
 def with_own_names(
     plans: Sequence[ChainPlan], together: Sequence[Sequence[int]] = ()
 ) -> list[ChainPlan]:
-    """The plans, whose servers have names of their own: each had a ``chain``, and an ``output``.
-    Equal servers are one in chains of one group, or whose cycles start at the same instants.
+    """Return the plans of chains with servers of different names.
+
+    Alone, each plan has a server ``chain``, and one ``output``. Equal servers keep one name in
+    chains of one group (places in ``together``), or whose cycles start at the same instants.
     """
-    group_of = {k: number for number, group in enumerate(together) for k in group}
-    known, renamed = dict[str, tuple[object, Server]](), []
-    for place, plan in enumerate(plans):
-        group = group_of.get(place, (plan.cycle_ns, plan.offset_ns))
+    group_of = {place: number for number, group in enumerate(together) for place in group}
+    known: dict[str, tuple[object, Server]] = {}
+    renamed = []
+    for place, chain_plan in enumerate(plans):
+        group = group_of.get(place, (chain_plan.cycle_ns, chain_plan.offset_ns))
         servers = []
-        for server in plan.servers:
-            own = (group, server)
-            name = next((n for n, one in known.items() if one == own), server.name)
-            while name in known and (known[name] != own or not server.threads):
+        for server in chain_plan.servers:
+            identity = (group, server)
+            same = (name for name, taken in known.items() if taken == identity)
+            name = next(same, server.name)
+            while name in known and (known[name] != identity or not server.threads):
                 name += f"_{place + 1}"
             servers.append(server.model_copy(update={"name": name}))
-            known[name] = own
-        renamed.append(revised(plan, servers=tuple(servers)))
+            known[name] = identity
+        renamed.append(revised(chain_plan, servers=tuple(servers)))
     return renamed
 
 
 def _on_wished_cores(
     profiles: Sequence[Profile], request: PlanRequest, time_limit_s: float
 ) -> tuple[Plan, list[str]]:
-    """The plan on the wished cores. Where chains collide although one of these is idle, the first
-    plan in which they do not, with one of them there.
+    """Return the plan on the wished cores.
+
+    Where chains collide although one of the cores is idle, one chain moves there: return the first
+    such plan without collisions.
     """
     moved, doubts = on_cores(profiles, request)
-    ways = [(moved, doubts)]
+    candidates = [(moved, doubts)]
     if request.policy != "pipelined":
-        used = {core for one in moved for core in one.core_of.values()}
-        for idle in [core for core in request.cores or () if core not in used][:1]:
-            ways += (moved_to(profiles, request.cores or (), of) for of in _one_on(moved, idle))
+        used = {core for profile in moved for core in profile.core_of.values()}
+        idle = next((core for core in request.cores or () if core not in used), None)
+        if idle is not None:
+            candidates += (
+                moved_to(profiles, request.cores or (), core_of)
+                for core_of in _with_a_chain_on(moved, idle)
+            )
         request = replace(request, cores=None)
-    found, refused = [], []
-    for moved, doubts in ways:
+    plans, errors = [], []
+    for moved, doubts in candidates:
         try:
             plan, remarks = _planned(moved, request, time_limit_s)
         except OperationError as error:
-            refused.append(error)
+            errors.append(error)
             continue
-        found.append((plan, [*doubts, *remarks]))
         if not remarks:
-            return found[-1]
-    if not found:
-        raise refused[0]
-    return found[0]
+            return plan, doubts
+        plans.append((plan, [*doubts, *remarks]))
+    if not plans:
+        raise errors[0]
+    return plans[0]
 
 
-def _one_on(profiles: Sequence[Profile], core: int) -> Iterator[dict[str, int]]:
-    """The core of each node, with one chain on this core that shares no node: those of few cores,
-    whose latencies change least, first.
+def _with_a_chain_on(profiles: Sequence[Profile], core: int) -> Iterator[dict[str, int]]:
+    """Yield the core of each node, with one chain moved to ``core`` that shares no node.
+
+    Chains on few cores come first: their latencies change least.
     """
-    core_of = {node: at for one in profiles for node, at in one.core_of.items()}
-    for one in sorted(profiles, key=lambda profile: len(set(profile.core_of.values()))):
-        others = {node for other in profiles if other is not one for node in other.core_of}
-        if others.isdisjoint(one.core_of):
-            yield {**core_of, **dict.fromkeys(one.core_of, core)}
+    core_of: dict[str, int] = {}
+    for profile in profiles:
+        core_of |= profile.core_of
+    for moved in sorted(profiles, key=lambda profile: len(set(profile.core_of.values()))):
+        beside = {node for profile in profiles if profile is not moved for node in profile.core_of}
+        if beside.isdisjoint(moved.core_of):
+            yield {**core_of, **dict.fromkeys(moved.core_of, core)}
 
 
 def _planned(
     profiles: Sequence[Profile], request: PlanRequest, time_limit_s: float
 ) -> tuple[Plan, list[str]]:
-    own, groups = replace(request, best_effort=()), beginning_together(profiles)
+    """Return the plan of chains on the cores of their profiles, and remarks about it."""
+    alone, groups = replace(request, best_effort=()), beginning_together(profiles)
 
-    def plans(shifting: bool = False, *, at_once: bool) -> list[ChainPlan]:
+    def plans_of_chains(shifting: bool = False, *, at_once: bool) -> list[ChainPlan]:
         delayed = with_interference(profiles, groups, request, at_once=at_once, shifting=shifting)
-        found = [_beside_others(profile, delayed, own) for profile in delayed]
+        plans = [_beside_others(profile, delayed, alone) for profile in delayed]
         for group in groups:
-            for k, plan in zip(group, _sharing_servers([found[k] for k in group]), strict=True):
-                found[k] = plan
-        return with_own_names(found, groups)
+            sharing = _sharing_servers([plans[place] for place in group])
+            for place, chain_plan in zip(group, sharing, strict=True):
+                plans[place] = chain_plan
+        return with_own_names(plans, groups)
 
-    at_once = None if request.policy in PER_CALLBACK else partial(plans, at_once=True)
+    at_once = None if request.policy in PER_CALLBACK else partial(plans_of_chains, at_once=True)
     placed, remarks = place_chains(
-        plans(at_once=False), together=groups, time_limit_s=time_limit_s, at_once=at_once
+        plans_of_chains(at_once=False), together=groups, time_limit_s=time_limit_s, at_once=at_once
     )
-    # What has no place in the chain's plan alone has none beside others.
-    pairs = zip(placed, profiles, strict=True)
-    placed_for = [one if has_places(plan) else without_reception(one) for plan, one in pairs]
-    placed = tuple(with_receivers_placed(placed, placed_for))
+    # Receivers without a place in the plan of their chain alone have none beside other chains.
+    with_places = [
+        profile if has_places(chain_plan) else without_reception(profile)
+        for chain_plan, profile in zip(placed, profiles, strict=True)
+    ]
+    placed = tuple(with_receivers_placed(placed, with_places))
     return Plan.of(*with_best_effort(placed, best_effort_cores(profiles, request))), remarks
 
 
 def _beside_others(profile: Profile, every: Sequence[Profile], request: PlanRequest) -> ChainPlan:
-    """The plan of one of several chains; who takes the room that it lacks is named."""
+    """Plan one of several chains. An error names the chains that take the room that it lacks."""
     try:
         return plan_chain(profile, request)
     except OperationError as error:
         core = profile.core_of.get(profile.last or "")
-        others = [one.name for one in every if one is not profile and core in one.core_of.values()]
+        names = [
+            beside.name
+            for beside in every
+            if beside is not profile and core in beside.core_of.values()
+        ]
         if core is None or not profile.interference_ns:
             raise
-        behind = f"{duration_text(profile.interference_ns)} behind {' and '.join(others)}"
+        behind = f"{duration_text(profile.interference_ns)} behind {' and '.join(names)}"
         reason = str(error).rstrip(".")
         raise OperationError(f"{profile.name} on core {core}, {behind}: {reason}") from error
 
 
 def beginning_together(profiles: Sequence[Profile]) -> list[list[int]]:
-    """The places of chains, together where they begin at the same callback."""
+    """Return groups of chains, by their places, that begin at the same callback."""
     groups: dict[Any, list[int]] = {}
     for place, profile in enumerate(profiles):
         key = place if profile.begins is None else (profile.begins, profile.period_ns)
@@ -191,7 +213,7 @@ def beginning_together(profiles: Sequence[Profile]) -> list[list[int]]:
 
 
 def _sharing_servers(plans: list[ChainPlan]) -> list[ChainPlan]:
-    """Branches of one graph: the same servers run it, and their outputs have slots apart."""
+    """Return plans for branches of one graph: the same servers run it, and outputs are apart."""
     if len(plans) == 1:
         return plans
     if plans[0].policy not in _SHARING:
@@ -203,55 +225,69 @@ def _sharing_servers(plans: list[ChainPlan]) -> list[ChainPlan]:
         for server in running_servers(plan):
             place = (server.core, server.slots[0][0])
             known = shared.get(place, server)
-            slots = max(known.slots, server.slots, key=lambda own: own[-1][1])
+            slots = max(known.slots, server.slots, key=lambda slots: slots[-1][1])
             threads = tuple(dict.fromkeys((*known.threads, *server.threads)))
             shared[place] = known.model_copy(update={"slots": slots, "threads": threads})
     taken: list[Server] = []
     changed = []
-    for plan in plans:  # so much later that no publish slots meet on their core
+    for plan in plans:
         gates = publishing_servers(plan)
+        # Publish slots move so much later that none meet on their core.
         by_ns = behind_others(chain_name(plan), gates, taken, plan.cycle_ns)
-        later = {s.name: [(start + by_ns, end + by_ns) for start, end in s.slots] for s in gates}
-        own = with_slots(gates, later)
-        taken += own
+        slots_of = {
+            server.name: [(start + by_ns, end + by_ns) for start, end in server.slots]
+            for server in gates
+        }
+        moved = with_slots(gates, slots_of)
+        taken += moved
         predicted = _later(plan.predicted, by_ns)
-        changed.append(revised(plan, servers=(*shared.values(), *own), predicted=predicted))
+        changed.append(revised(plan, servers=(*shared.values(), *moved), predicted=predicted))
     return changed
 
 
 def _later(predicted: Prediction, later_ns: int) -> Prediction:
-    times = {"mean_ns": predicted.mean_ns + later_ns, "max_ns": predicted.max_ns + later_ns}
-    modes = {mode: _later(own, later_ns) for mode, own in (predicted.modes or {}).items()}
-    return predicted.model_copy(update={**times, "modes": modes or None})
+    """Return the prediction for outputs that leave so much later."""
+    modes = {mode: _later(of_mode, later_ns) for mode, of_mode in (predicted.modes or {}).items()}
+    return predicted.model_copy(
+        update={
+            "mean_ns": predicted.mean_ns + later_ns,
+            "max_ns": predicted.max_ns + later_ns,
+            "modes": modes or None,
+        }
+    )
 
 
 def _fitting(
     profiles: Sequence[Profile], request: PlanRequest, time_limit_s: float
 ) -> Iterator[str]:
-    """What would make the chains fit, in words: each was tried."""
+    """Yield what would make the chains fit, in words, after having tried it."""
 
-    def fits(wished: PlanRequest, those: Sequence[Profile] = profiles) -> bool:
+    def fits(wished: PlanRequest, candidates: Sequence[Profile] = profiles) -> bool:
         try:
-            _on_wished_cores(those, wished, min(time_limit_s, 2.0))
+            _on_wished_cores(candidates, wished, min(time_limit_s, 2.0))
         except (OperationError, InputError):
             return False
         return True
 
-    recorded = sorted({core for one in profiles for core in one.core_of.values()})
+    recorded = sorted({core for profile in profiles for core in profile.core_of.values()})
     named = request.cores or tuple(recorded)
     free = 1 + max(named, default=0)
     if request.policy != "pipelined":
         more = ((*named, *range(free, free + count)) for count in range(1, len(profiles)))
-        enough = next((one for one in more if fits(replace(request, cores=one))), None)
+        enough = next((cores for cores in more if fits(replace(request, cores=cores))), None)
         if enough:
             yield f"--cores {','.join(map(str, enough))}"
     elif request.cores and fits(replace(request, cores=None)):
         yield f"the cores of the recording, {','.join(map(str, recorded))}: without --cores"
     elif not request.cores:
-        for core_of in _one_on(profiles, free):
+        for core_of in _with_a_chain_on(profiles, free):
             if fits(request, moved_to(profiles, (), core_of)[0]):
-                names = (one.name for one in profiles if free in map(core_of.get, one.core_of))
-                yield f"{''.join(names)} on a core of its own while it is recorded"
+                moved = next(
+                    profile.name
+                    for profile in profiles
+                    if free in map(core_of.get, profile.core_of)
+                )
+                yield f"{moved} on a core of its own while it is recorded"
     if request.epsilon_ns and fits(replace(request, epsilon_ns=0)):
         margins = range(_MARGIN_STEP_NS, request.epsilon_ns + 1, _MARGIN_STEP_NS)
         most = bisect(margins, False, key=lambda ns: not fits(replace(request, epsilon_ns=ns)))

@@ -1,7 +1,6 @@
 """Figures: latency per cycle, its distribution with the publish slots, figure 7, sweeps.
 
-All are drawn from recordings or plans alone. The colours stay apart for colour-blind readers and
-in grey print.
+The colours differ for colour-blind readers and in grey print as well.
 """
 
 import io
@@ -25,7 +24,7 @@ from chainshaper.verify.measure import Comparison, Measurement
 
 COLOURS = ("#d95f02", "#1b6ca8", "#4d9221", "#7b3294")
 SIZE_INCHES = (9.0, 4.2)
-MOST_LINES = 12
+MOST_LINES = 12  # of a sweep
 ENDINGS = (".png", ".pdf", ".svg")
 
 
@@ -40,9 +39,9 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
 
 
 def draw_comparison(measurements: Sequence[Measurement], folder: str | Path) -> tuple[Path, Path]:
-    """Both figures, as `latency.png` and `distribution.png` in a folder that is made if needed.
+    """Draw `latency.png` and `distribution.png` into a folder, which is made if needed.
 
-    Raises InputError: one of them exists already. OperationError: they cannot be written.
+    Raises InputError: one of the files exists already. OperationError: they cannot be written.
     """
     latency, distribution = Path(folder) / "latency.png", Path(folder) / "distribution.png"
     for path in (latency, distribution):
@@ -56,20 +55,23 @@ def draw_comparison(measurements: Sequence[Measurement], folder: str | Path) -> 
 
 
 @contextmanager
-def _own_style() -> Iterator[None]:
-    """Draw in the user's style, unless others may have written it; the caller's stays as it is."""
+def _user_style() -> Iterator[None]:
+    """Draw in the user's style of matplotlib, unless others may have written that file.
+
+    The style of a program that calls this is not changed.
+    """
     import matplotlib as mpl
 
     with mpl.rc_context():
         style = Path(mpl.matplotlib_fname())
         if style.parent == Path.cwd() or why_distrusted(style) is not None:
-            mpl.rcdefaults()  # it may have TeX run, with a preamble of others
+            mpl.rcdefaults()  # the file may start TeX, with a preamble that others wrote
         yield
 
 
-@_own_style()
+@_user_style()
 def draw_latency(measurements: Sequence[Measurement], path: str | Path) -> Path:
-    """End-to-end latency of every cycle, all recordings in one picture (paper, figure 6).
+    """Draw the end-to-end latency of every cycle, all recordings in one picture (paper, figure 6).
 
     Crosses mark cycles that the machine disturbed. The picture ends a little above the highest
     undisturbed cycle.
@@ -88,9 +90,9 @@ def draw_latency(measurements: Sequence[Measurement], path: str | Path) -> Path:
     return _save_chain(figure, axes, measurements, path)
 
 
-@_own_style()
+@_user_style()
 def draw_distribution(measurements: Sequence[Measurement], path: str | Path) -> Path:
-    """Cumulative distribution of the latency over undisturbed cycles, publish slots shaded."""
+    """Draw the cumulative distribution of undisturbed latencies, with publish slots shaded."""
     figure, axes = _new_figure()
     for measurement, colour in zip(measurements, cycle(COLOURS), strict=False):
         latency = np.sort(measurement.analysis.calm["latency_ns"].to_numpy()) / 1e6
@@ -99,8 +101,8 @@ def draw_distribution(measurements: Sequence[Measurement], path: str | Path) -> 
         axes.step(latency, share, where="post", color=colour, label=label)
         slots = () if measurement.plan is None else slots_of_latency(measurement.plan)
         for number, (start, end) in enumerate(slots):
-            look = {"color": "0.8", "zorder": 0, "label": None if number else "publish slot"}
-            axes.axvspan(start / 1e6, end / 1e6, **look)
+            in_legend = None if number else "publish slot"  # once
+            axes.axvspan(start / 1e6, end / 1e6, color="0.8", zorder=0, label=in_legend)
     axes.set(xlabel="end-to-end latency [ms]", ylabel="share of cycles")
     return _save_chain(figure, axes, measurements, path, vertical=False)
 
@@ -113,18 +115,25 @@ def _save_chain(
     *,
     vertical: bool = True,
 ) -> Path:
-    """Let single cycles that waited for another slot not squeeze all others into a line."""
+    """Add title and legend and save a figure whose ``vertical`` or horizontal axis has latencies.
+
+    The axis ends at undisturbed latencies: else single disturbed cycles, which waited for another
+    slot, squeeze all others into a line.
+    """
     highest = max(measurement.analysis.undisturbed.max_ns or 0 for measurement in measurements)
-    if highest:
-        (axes.set_ylim if vertical else axes.set_xlim)(0, highest / 1e6 * 1.15)
+    limit_ms = highest / 1e6 * 1.15
+    if highest and vertical:
+        axes.set_ylim(0, limit_ms)
+    elif highest:
+        axes.set_xlim(0, limit_ms)
     axes.set_title(f"Chain {measurements[0].analysis.chain.spec}", loc="left")
     axes.legend(loc="lower right" if vertical else "upper left")
     return _save_figure(figure, path)
 
 
-@_own_style()
+@_user_style()
 def draw_curve(choice: BandChoice, path: str | Path) -> Path:
-    """The average latency over the number of bands (paper, figure 7), the chosen number marked.
+    """Draw the average latency over the number of bands (paper, figure 7); mark the chosen number.
 
     Raises InputError: the file exists already, or ends as no picture does. OperationError: it
     cannot be written.
@@ -134,28 +143,35 @@ def draw_curve(choice: BandChoice, path: str | Path) -> Path:
     bands = [len(placement.slot_ends_ns) for placement in choice.curve]
     means = [placement.mean_ns / 1e6 for placement in choice.curve]
     axes.plot(bands, means, "o-", color=COLOURS[1], label="best placement")
-    chosen = len(choice.chosen.slot_ends_ns), choice.chosen.mean_ns / 1e6
-    look = {"markersize": 12, "fillstyle": "none", "color": COLOURS[0], "label": choice.reason}
-    axes.plot(*chosen, "o", **look)
+    axes.plot(
+        len(choice.chosen.slot_ends_ns),
+        choice.chosen.mean_ns / 1e6,
+        "o",
+        markersize=12,
+        fillstyle="none",
+        color=COLOURS[0],
+        label=choice.reason,
+    )
     axes.set_xticks(bands)
     axes.set(xlabel="number of latency bands", ylabel="average latency, eq. 5 [ms]")
     axes.legend(loc="upper right")
     return _save_figure(figure, path)
 
 
-@_own_style()
+@_user_style()
 def draw_sweep(frame: pl.DataFrame, path: Path) -> Path:
-    """Average and jitter over the first axis, a line for each combination of the others.
+    """Draw average and jitter over the first axis, a line for each combination of the others.
 
     Raises OperationError: the picture cannot be written.
     """
-    first, *others = sweep_axes(frame)
+    first, *further_axes = sweep_axes(frame)
     places = {value: place for place, value in enumerate(frame[first].unique(maintain_order=True))}
     figure, panels = _new_figure(panels=2)
-    lines = frame.partition_by(others, maintain_order=True) if others else [frame]
+    lines = frame.partition_by(further_axes, maintain_order=True) if further_axes else [frame]
     for points in lines[:MOST_LINES]:
         name = ", ".join(
-            f"{axis.removesuffix('_ns')} {sweep_value(axis, points[axis][0])}" for axis in others
+            f"{axis.removesuffix('_ns')} {sweep_value(axis, points[axis][0])}"
+            for axis in further_axes
         )
         for axes, column in zip(panels, ("mean_ns", "jitter_ns"), strict=True):
             # A point that failed has no value: the line has a gap there.
@@ -165,29 +181,32 @@ def draw_sweep(frame: pl.DataFrame, path: Path) -> Path:
         axes.set_xticks(list(places.values()), [sweep_value(first, value) for value in places])
         axes.set(xlabel=first.removesuffix("_ns"), ylabel=f"{title} [ms]")
         axes.set_ylim(bottom=0)
-    if others:
+    if further_axes:
         more = f" (the first {MOST_LINES} of {len(lines)})" if len(lines) > MOST_LINES else ""
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", title=more)
     return _save_figure(figure, path)
 
 
 def _new_figure(panels: int = 1) -> tuple[Any, Any]:
-    """A figure and its axes; of several panels, beside each other, a sequence of axes."""
+    """Make a figure and its axes; if there are several panels, a sequence of axes."""
     from matplotlib.figure import Figure
 
     figure = Figure(SIZE_INCHES, layout="constrained")
     axes = figure.subplots(1, panels)
-    for one in figure.axes:
-        one.grid(alpha=0.3)
+    for panel in figure.axes:
+        panel.grid(alpha=0.3)
     return figure, axes
 
 
 def _save_figure(figure: Any, path: str | Path) -> Path:
-    """Write a figure, as its file's ending says. Raises OperationError: it cannot be written."""
+    """Write a figure in the format that its file's ending names.
+
+    Raises OperationError: it cannot be written.
+    """
     from matplotlib.text import Text
 
     for text in figure.findobj(Text):
-        if text.get_text():  # those of numbers at the axes have none yet
+        if text.get_text():  # the numbers at the axes have no text yet
             text.set_parse_math(False)  # a name may have dollars
             text.set_text(shown(text.get_text(), but="\n"))
     path, picture = Path(path), io.BytesIO()

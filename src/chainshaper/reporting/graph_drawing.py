@@ -1,17 +1,17 @@
 """The application graph: as plain data, as a table, and as a picture (SVG, or DOT for Graphviz).
 
 Nodes are boxes of callbacks, with topics between them; arrows run from the callback that publishes
-a topic to the callbacks that it triggers. A dashed arrow is a message that one callback reads and
-another callback of the node publishes for it (synchronisers, stored messages). An arrow at a node's
-title stands for publications outside its callbacks, or for subscriptions without callback events.
-What every node has for itself (parameter services, /rosout, /parameter_events) is left out of
-tables and pictures unless asked for; in JSON it is marked.
+a topic to the callbacks that it triggers. A dashed arrow is a topic that another callback of the
+node publishes for this one (synchronisers, stored messages). An arrow at a node's title stands for
+publications outside its callbacks, or for subscriptions without callback events. The services and
+topics that every node has (parameter services, /rosout, /parameter_events) are left out of tables
+and pictures unless asked for; in JSON they are marked.
 
-The layout is that of Sugiyama, Tagawa and Toda (1981): edges that close cycles are turned around;
-every box gets a column, as far left as its predecessors permit; columns are sorted so that few
-edges cross (barycentres, swept back and forth); heights are least squares under the order and the
-gaps of a column, so that edges run straight. Edges over several columns pass them through places of
-their own. Parts that are not connected are laid out one below the other.
+The layout is that of Sugiyama, Tagawa and Toda (1981). Edges that close cycles are turned around.
+Every box gets a column, as far left as its predecessors permit. Columns are sorted so that few
+edges cross (barycentres, swept back and forth). Heights are least squares under the order and the
+gaps of a column, so that edges run straight. An edge over several columns has a place in each.
+Parts that are not connected are laid out one below the other.
 """
 
 import json
@@ -41,18 +41,19 @@ from chainshaper.values.recording import lost_text
 
 ENDINGS = (".svg", ".dot", ".json")
 
-_OWN_TOPICS = INTERNAL_TOPICS - {"/clock"}
+_LEFT_OUT_TOPICS = INTERNAL_TOPICS - {"/clock"}
 _LAMBDA = re.compile(r"\{lambda\(.*?\)#(\d+)\}$")
 _BIND = re.compile(r"std::_Bind<.*?\((\w[\w:]*)::\*")
 
+# Lengths in pixels.
 COLUMN_GAP = 48.0
 ROW_GAP = 22.0
-PLACE_HEIGHT = 6.0
-SWEEPS = 16
+PLACE_HEIGHT = 6.0  # of the place of an edge that passes a column
+SWEEPS = 16  # how often columns are swept, to sort them and to choose heights
 
 MARGIN = 24.0
-CHARACTER = 7.3  # width of one of 12 px
-SMALL = 6.3  # and of 10 px
+CHARACTER = 7.3  # width of a character of 12 px
+SMALL = 6.3  # width of a character of 10 px
 TITLE, ROW, PILL, PAD = 28.0, 36.0, 26.0, 10.0
 TURN = 45.0  # how far an arrow goes on before it turns around
 LONGEST = 46  # characters of a function's name
@@ -80,19 +81,22 @@ Point: TypeAlias = tuple[float, float]
 
 
 def is_internal(name: str | None) -> bool:
-    """Whether a topic or service is one that every node has for itself."""
+    """Whether a topic or service is one that every node has."""
     return name is not None and (
-        name in _OWN_TOPICS or name.rpartition("/")[2] in INTERNAL_SERVICES
+        name in _LEFT_OUT_TOPICS or name.rpartition("/")[2] in INTERNAL_SERVICES
     )
 
 
 def without_internals(application: ApplicationDescription) -> ApplicationDescription:
-    """The application without what every node has for itself."""
+    """The application without the topics, services and callbacks that every node has."""
     graph = application.graph
     callbacks = tuple(
-        replace(one, publishes=tuple(t for t in one.publishes if not is_internal(t)))
-        for one in graph.callbacks
-        if not is_internal(one.topic)
+        replace(
+            callback,
+            publishes=tuple(topic for topic in callback.publishes if not is_internal(topic)),
+        )
+        for callback in graph.callbacks
+        if not is_internal(callback.topic)
     )
     publishers, subscribers = (
         {topic: nodes for topic, nodes in ends.items() if not is_internal(topic)}
@@ -108,15 +112,15 @@ def application_json(application: ApplicationDescription) -> dict[str, Any]:
     names = ("id", "node", "pid", "kind", "topic", "period_ns", "declared_ns")
     written = ("symbol", "publishes", "passes_on")
     callbacks = [
-        {name: getattr(one, name) for name in (*names, *written)}
-        | {"pids": list(one.processes), "internal": is_internal(one.topic)}
-        for one in graph.callbacks
+        {name: getattr(callback, name) for name in (*names, *written)}
+        | {"pids": list(callback.processes), "internal": is_internal(callback.topic)}
+        for callback in graph.callbacks
     ]
     topics = []
     for topic in graph.topics:
         ends = graph.publishers.get(topic, ()), graph.subscribers.get(topic, ())
-        found = {"name": topic, "publishers": list(ends[0]), "subscribers": list(ends[1])}
-        topics.append({**found, "internal": is_internal(topic)})
+        entry = {"name": topic, "publishers": list(ends[0]), "subscribers": list(ends[1])}
+        topics.append({**entry, "internal": is_internal(topic)})
     services: dict[str, dict[str, Any]] = {}
     rows = application.services.sort("service", maintain_order=True)
     for name, role, node, _ in rows.iter_rows():
@@ -136,21 +140,21 @@ def application_json(application: ApplicationDescription) -> dict[str, Any]:
 
 
 def application_table(application: ApplicationDescription) -> ResultTable:
-    """One row per callback, by node."""
+    """Make a table of callbacks, sorted by node."""
     names = [*words("node"), Column("process"), *words("callback", "publishes", "function")]
     table = ResultTable("Application", names)
     for node in sorted(_nodes(application), key=lambda node: (node.name, node.pid)):
         cells = [
-            (callback_text(one), ", ".join(one.publishes), short_symbol(one.symbol))
-            for one in node.callbacks
+            (callback_text(callback), ", ".join(callback.publishes), short_symbol(callback.symbol))
+            for callback in node.callbacks
         ]
-        for own in cells or [("", "", "")]:
-            table.add(node.name, node.processes, *own)
+        for row in cells or [("", "", "")]:
+            table.add(node.name, node.processes, *row)
     return table
 
 
 def callback_text(callback: Callback) -> str:
-    """What triggers a callback, in few words."""
+    """Text: what triggers a callback."""
     if callback.kind == "timer":
         return f"timer {period_text(callback.period_ns or 0, callback.declared_ns)}"
     if callback.kind == "unknown":
@@ -179,11 +183,11 @@ def short_symbol(symbol: str | None) -> str:
 
 @dataclass(frozen=True)
 class _NodeBox:
-    """A node as it is drawn: a title, and a row for each callback."""
+    """A node in the picture: a title, and a row for each callback."""
 
     name: str
     pid: int
-    processes: str  # of a node that was started again all
+    processes: str  # their ids, several of a node that was started again
     callbacks: Sequence[Callback]
 
     @property
@@ -220,26 +224,29 @@ class _NodeBox:
 
 
 def _row_texts(callback: Callback) -> tuple[str, str]:
-    """What triggers it, except for a topic (the arrow comes from there); and its function."""
+    """Texts of a callback's row: what triggers it (a topic has an arrow), and its function."""
     trigger = callback.kind if callback.kind == "subscription" else callback_text(callback)
     function = short_symbol(callback.symbol)
     return trigger, function if len(function) <= LONGEST else function[: LONGEST - 1] + "…"
 
 
 def _nodes(application: ApplicationDescription) -> list[_NodeBox]:
+    """Make a box for each node, and for each process of nodes that ran at the same time."""
     graph = application.graph
-    rows: dict[tuple[str, int], list[Callback]] = {(one.name, one.pid): [] for one in graph.nodes}
+    rows: dict[tuple[str, int], list[Callback]] = {
+        (node.name, node.pid): [] for node in graph.nodes
+    }
     for callback in graph.callbacks:
         rows.setdefault((callback.node, callback.pid), []).append(callback)
-    processes = {(one.name, one.pid): listed(one.processes) for one in graph.nodes}
+    processes = {(node.name, node.pid): listed(node.processes) for node in graph.nodes}
     return [
-        _NodeBox(name, pid, processes.get((name, pid), str(pid)), own)
-        for (name, pid), own in rows.items()
+        _NodeBox(name, pid, processes.get((name, pid), str(pid)), callbacks)
+        for (name, pid), callbacks in rows.items()
     ]
 
 
 def application_svg(application: ApplicationDescription) -> str:
-    """The picture as the text of an SVG file."""
+    """Draw the picture, as the text of an SVG file."""
     nodes = _nodes(application)
     topics = [t for t in application.graph.topics if t and not t.startswith("ros_")]
     arrows = list(_arrows(application, nodes, topics))
@@ -274,7 +281,10 @@ def _group(corner: Point) -> str:
 def _arrows(
     application: ApplicationDescription, nodes: list[_NodeBox], topics: list[str]
 ) -> Iterator[tuple["Edge", str]]:
-    """Arrows and their classes: callbacks and topics, then titles where no callback is known."""
+    """Yield the arrows with their classes, between callbacks and topics.
+
+    Where no callback of a node is known to publish or read a topic, its title has the arrow.
+    """
     graph = application.graph
     place = {topic: len(nodes) + index for index, topic in enumerate(topics)}
     for index, node in enumerate(nodes):
@@ -297,7 +307,10 @@ def _arrows(
 
 
 def _arrow(route: list[Point], style: str) -> str:
-    """Horizontal ends, curves between the columns; backward arrows turn around at both ends."""
+    """Draw an arrow: horizontal ends, curves between columns.
+
+    Backward arrows turn around at both ends.
+    """
     backwards = route[-1][0] < route[0][0]
     (x, y), *rest = route
     path = [f"M {x:.1f} {y:.1f}"]
@@ -324,21 +337,21 @@ def application_dot(application: ApplicationDescription) -> str:
         title = _quoted(f"{node.name} (process {node.processes})")
         lines += [f"  subgraph cluster_{index} {{", f"    label={title};"]
         lines.append(f'    node_{index} [shape=point, style=invis, label=""];')
-        for one in node.callbacks:
-            label = _quoted(f"{callback_text(one)}\n{short_symbol(one.symbol)}".strip())
-            lines.append(f"    callback_{one.id} [shape=box, label={label}];")
+        for callback in node.callbacks:
+            label = _quoted(f"{callback_text(callback)}\n{short_symbol(callback.symbol)}".strip())
+            lines.append(f"    callback_{callback.id} [shape=box, label={label}];")
         lines.append("  }")
     lines += [f"  {_quoted(topic)} [shape=ellipse];" for topic in graph.topics]
-    for one in graph.callbacks:
-        vertex, trigger = f"callback_{one.id}", one.topic
-        if one.trigger in graph.topics:
-            trigger = one.trigger
-        elif trigger is not None:  # of whose calls there are no events
+    for callback in graph.callbacks:
+        vertex, trigger = f"callback_{callback.id}", callback.topic
+        if callback.trigger in graph.topics:
+            trigger = callback.trigger
+        elif trigger is not None:  # a service without events of its calls
             lines.append(f"  {_quoted(trigger)} [shape=cds];")
         if trigger is not None:
             lines.append(f"  {_quoted(trigger)} -> {vertex};")
-        for topic in one.publishes:
-            style = " [style=dashed]" if topic in one.passes_on else ""
+        for topic in callback.publishes:
+            style = " [style=dashed]" if topic in callback.passes_on else ""
             lines.append(f"  {vertex} -> {_quoted(topic)}{style};")
     return "\n".join([*lines, "}", ""])
 
@@ -368,27 +381,28 @@ def write_picture(
 
 
 class Box(NamedTuple):
-    """Something to place: its size."""
+    """The size of something to be placed."""
 
     width: float
     height: float
 
 
 class Edge(NamedTuple):
-    """An arrow between two boxes (their numbers), leaving and entering at heights inside them."""
+    """An arrow between two boxes."""
 
-    source: int
+    source: int  # number of the box
     target: int
-    leaves: float
-    enters: float
+    leaves: float  # height inside the source where it begins
+    enters: float  # height inside the target where it ends
 
 
 class Layout(NamedTuple):
-    """Left upper corners of the boxes, ways of the edges, from the right side of the source to the
-    left side of the target, and the size of it all."""
+    """Where boxes and edges are placed."""
 
-    corners: list[Point]
-    routes: list[list[Point]]
+    corners: list[Point]  # the left upper ones of the boxes
+    routes: list[
+        list[Point]
+    ]  # of each edge, from the right side of its source to its target's left
     width: float
     height: float
 
@@ -399,18 +413,21 @@ Beside: TypeAlias = dict[int, list[tuple[int, float, float]]]
 
 @dataclass
 class _ConnectedPart:
-    """A connected part in columns: vertices are its boxes and, behind them, edges' places."""
+    """A connected part in columns.
 
-    layer: dict[int, int]
-    height: dict[int, float]
-    places: dict[int, list[int]] = field(default_factory=dict)  # of each edge, left to right
-    columns: list[list[int]] = field(default_factory=list)
+    Vertices are its boxes, and the places of edges that pass columns, numbered after all boxes.
+    """
+
+    layer: dict[int, int]  # vertex → number of its column
+    height: dict[int, float]  # vertex → its height
+    places: dict[int, list[int]] = field(default_factory=dict)  # edge → its places, left to right
+    columns: list[list[int]] = field(default_factory=list)  # of each the vertices, top to bottom
     segments: list[tuple[int, int, float, float]] = field(default_factory=list)
     """Left and right vertex, and the heights inside them."""
-    y: dict[int, float] = field(default_factory=dict)
+    y: dict[int, float] = field(default_factory=dict)  # vertex → its top
 
     def beside(self) -> tuple[Beside, Beside]:
-        """The neighbours of each vertex, to its left and to its right."""
+        """Find the neighbours of each vertex, to its left and to its right."""
         before, after = defaultdict[int, Any](list), defaultdict[int, Any](list)
         for left, right, leaves, enters in self.segments:
             before[right].append((left, enters, leaves / (self.height[left] + 1)))
@@ -418,32 +435,34 @@ class _ConnectedPart:
         return before, after
 
     def place(self) -> dict[int, int]:
-        """The place of each vertex in its column."""
+        """Map each vertex to its place in its column."""
         return {v: place for column in self.columns for place, v in enumerate(column)}
 
 
 def lay_out(boxes: Sequence[Box], edges: Sequence[Edge]) -> Layout:
-    """Place boxes and edges. Cost is about that of sorting, times the number of sweeps."""
+    """Place boxes and edges; the cost is about that of sorting, times the number of sweeps."""
     corners = [(0.0, 0.0)] * len(boxes)
     routes: list[list[Point]] = [[] for _ in edges]
     top, width = 0.0, 0.0
     parts = linked(len(boxes), [(edge.source, edge.target) for edge in edges])
     for members in sorted(parts, key=len, reverse=True):
         chosen = set(members)
-        own = {number: edge for number, edge in enumerate(edges) if edge.source in chosen}
-        part = _layered(members, boxes, own)
+        edges_of_part = {number: edge for number, edge in enumerate(edges) if edge.source in chosen}
+        part = _layered(members, boxes, edges_of_part)
         _sort_columns(part)
         _choose_heights(part)
         sides, left = [], 0.0  # left and right side of every column
         for column in part.columns:
-            right = left + max((boxes[v].width for v in column if v < len(boxes)), default=0.0)
+            right = left + max(
+                (boxes[vertex].width for vertex in column if vertex < len(boxes)), default=0.0
+            )
             sides.append((left, right))
             left = right + COLUMN_GAP
         lowest = min(part.y.values())
         y = {vertex: height - lowest + top for vertex, height in part.y.items()}
         for vertex in members:
             corners[vertex] = (sides[part.layer[vertex]][0], y[vertex])
-        for number, edge in own.items():
+        for number, edge in edges_of_part.items():
             (from_x, from_y), (to_x, to_y) = corners[edge.source], corners[edge.target]
             between = [
                 (side, y[place] + PLACE_HEIGHT / 2)
@@ -460,10 +479,10 @@ def lay_out(boxes: Sequence[Box], edges: Sequence[Edge]) -> Layout:
 
 
 def _layered(chosen: list[int], boxes: Sequence[Box], edges: Mapping[int, Edge]) -> _ConnectedPart:
-    """Columns by the longest path from the sources, and places for edges that pass columns.
+    """Put boxes into columns by the longest path from the sources; add places for passing edges.
 
-    Edges that close a cycle are those that lead back in the order of a depth-first search from the
-    sources. Sources then move right, next to what they feed.
+    Edges close a cycle if they lead back in the order of a depth-first search from the sources.
+    Sources then move right, next to the boxes that they lead to.
     """
     follows: dict[int, list[int]] = {vertex: [] for vertex in chosen}
     for edge in edges.values():
@@ -507,7 +526,7 @@ def _layered(chosen: list[int], boxes: Sequence[Box], edges: Mapping[int, Edge])
 
 
 def _sort_columns(part: _ConnectedPart) -> None:
-    """Order each column by the mean position of its neighbours; the best order seen stays."""
+    """Order each column by the mean position of its neighbours; the fewest crossings count."""
     before, after = part.beside()
     best, fewest = [list(column) for column in part.columns], _crossings(part)
     for sweep in range(SWEEPS):
@@ -527,7 +546,7 @@ def _sort_columns(part: _ConnectedPart) -> None:
 
 
 def _crossings(part: _ConnectedPart) -> int:
-    """How many pairs of segments cross: those whose ends are in another order than their begins."""
+    """Count pairs of segments that cross: their ends are in another order than their beginnings."""
     place, by_column = part.place(), defaultdict[int, list[tuple[float, float]]](list)
     for left, right, leaves, enters in part.segments:
         begin = place[left] + leaves / (part.height[left] + 1)
@@ -538,7 +557,7 @@ def _crossings(part: _ConnectedPart) -> int:
 
 
 def _choose_heights(part: _ConnectedPart) -> None:
-    """Heights that let edges run straight, column by column, back and forth."""
+    """Choose heights so that edges run straight, column by column, back and forth."""
     before, after = part.beside()
     for column in part.columns:
         tops = accumulate((part.height[vertex] + ROW_GAP for vertex in column), initial=0.0)
@@ -555,7 +574,7 @@ def _choose_heights(part: _ConnectedPart) -> None:
                     part.y[w] + share * (part.height[w] + 1) - inside for w, inside, share in beside
                 ]
                 wanted.append(sum(pulls) / len(pulls) if pulls else part.y[vertex])
-                # Long edges run straight first; what has no neighbour gives way.
+                # Edges over several columns pull most; a vertex without neighbours gives way.
                 straight = 4.0 if part.height[vertex] == PLACE_HEIGHT else 1.0
                 weights.append(straight * len(pulls) if pulls else 0.01)
             sizes = [part.height[vertex] + ROW_GAP for vertex in column]
@@ -563,17 +582,20 @@ def _choose_heights(part: _ConnectedPart) -> None:
 
 
 def _apart(sizes: list[float], wanted: list[float], weights: list[float]) -> list[float]:
-    """The heights nearest to ``wanted`` that keep order and gaps (isotonic regression; SciPy's own
-    takes longer to import than a whole drawing).
+    """Find the heights nearest to ``wanted`` that keep order and gaps.
+
+    It is isotonic regression. SciPy has it, but takes longer to import than a whole drawing.
     """
     offsets = list(accumulate(sizes, initial=0.0))[:-1]
     blocks: list[tuple[float, float, int]] = []  # mean, weight, members
-    for want, weight, offset in zip(wanted, weights, offsets, strict=True):
-        mean, heavy, members = want - offset, weight, 1
+    for height, weight, offset in zip(wanted, weights, offsets, strict=True):
+        mean, weight_of_block, members = height - offset, weight, 1
         while blocks and blocks[-1][0] > mean:
-            other, more, joined = blocks.pop()
-            mean = (mean * heavy + other * more) / (heavy + more)
-            heavy, members = heavy + more, members + joined
-        blocks.append((mean, heavy, members))
+            mean_before, weight_before, joined = blocks.pop()
+            mean = (mean * weight_of_block + mean_before * weight_before) / (
+                weight_of_block + weight_before
+            )
+            weight_of_block, members = weight_of_block + weight_before, members + joined
+        blocks.append((mean, weight_of_block, members))
     flat = (mean for mean, _, members in blocks for _ in range(members))
     return [y + offset for y, offset in zip(flat, offsets, strict=True)]

@@ -1,5 +1,8 @@
-"""A chain's latency, as tables and as plain data: its figures, recordings beside each other, a
-prediction beside its measurement, where the time goes, and what has no latency."""
+"""A chain's latency, as tables and as plain data.
+
+They show its figures, several recordings beside each other, a prediction beside its measurement,
+where the time goes, and cycles that have no latency.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -37,10 +40,13 @@ from chainshaper.verify.predictions import JudgedFigure, JudgedPrediction, jitte
 from chainshaper.verify.promises import outputs_due
 
 LATE = ("came late", "maximum", "jitter (max − min)")
-"""The rows that say what happened to cycles that are called disturbed."""
+"""The rows of all cycles that disturbed cycles change."""
 
 JSON_FORMAT = 1
-"""Of the objects that `latency`, `compare`, `check` print; another if a key changes its meaning."""
+"""Version of the JSON that `latency`, `compare` and `check` print.
+
+It changes when a key changes its meaning.
+"""
 
 CONVENTION = (
     "at_start: every output leaves as its slot starts, as a gate does it; at_end: at its slot's"
@@ -50,30 +56,32 @@ CONVENTION = (
 
 
 def _rows(columns: Sequence[LatencyStatistics | None]) -> dict[str, list[str]]:
-    """Every figure by its title, a cell for each column's statistics."""
+    """Make the rows of figures by their titles, with a cell for each column's statistics."""
     cells: dict[str, Callable[[LatencyStatistics], str]] = {
-        "average": lambda one: ms(one.mean_ns),
-        "minimum": lambda one: ms(one.min_ns),
-        "maximum": lambda one: ms(one.max_ns),
-        "jitter (max − min)": lambda one: ms(one.jitter_ns),
-        "spread p0.5–p99.5": lambda one: ms(one.spread_ns),
-        "median": lambda one: ms(one.percentiles_ns.get("50")),
-        "99th percentile": lambda one: ms(one.percentiles_ns.get("99")),
-        "cycles": lambda one: str(one.count),
-        "came late": lambda one: ABSENT if one.late is None else f"{one.late} of {one.count}",
+        "average": lambda statistics: ms(statistics.mean_ns),
+        "minimum": lambda statistics: ms(statistics.min_ns),
+        "maximum": lambda statistics: ms(statistics.max_ns),
+        "jitter (max − min)": lambda statistics: ms(statistics.jitter_ns),
+        "spread p0.5–p99.5": lambda statistics: ms(statistics.spread_ns),
+        "median": lambda statistics: ms(statistics.percentiles_ns.get("50")),
+        "99th percentile": lambda statistics: ms(statistics.percentiles_ns.get("99")),
+        "cycles": lambda statistics: str(statistics.count),
+        "came late": lambda statistics: (
+            ABSENT if statistics.late is None else f"{statistics.late} of {statistics.count}"
+        ),
     }
     return {
-        title: [ABSENT if one is None else cell(one) for one in columns]
+        title: [ABSENT if column is None else cell(column) for column in columns]
         for title, cell in cells.items()
     }
 
 
 def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[str, Any]:
-    """One chain's latency as plain data; ``instances`` adds every complete traversal.
+    """A chain's latency as plain data; ``instances`` adds every complete traversal.
 
-    Without ``stalls_watched`` stalls of the machine are not known, so ``disturbed`` is 0 whatever
-    it did. ``late``, ``max_all_ns`` and ``jitter_all_ns`` leave no cycle out. Instances have their
-    start and end in ns of the trace clock (wall clock).
+    If ``stalls_watched`` is false, stalls of the machine are not known, and ``disturbed`` is 0.
+    ``late``, ``max_all_ns`` and ``jitter_all_ns`` are over all cycles. Instances have their start
+    and end in ns of the wall clock.
     """
     analysis, info = measurement.analysis, measurement.recording.info
     overruns, dropped = measurement.overruns, measurement.dropped
@@ -91,7 +99,9 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
         "silent": analysis.silent,
         "overruns": None if overruns is None else sum(overruns.values()),
         "overruns_by_policy": overruns,
-        "overrun_outcomes": {name: asdict(one) for name, one in measurement.outcomes.items()},
+        "overrun_outcomes": {
+            name: asdict(outcome) for name, outcome in measurement.outcomes.items()
+        },
         "into_open_slots": measurement.into_open_slots,
         "moves": moves_in(analysis),
         "dropped": None if dropped is None else sum(dropped.values()),
@@ -129,15 +139,15 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
 
 
 def comparisons_json(comparisons: Sequence[Comparison]) -> dict[str, Any]:
-    """A comparison as plain data; of several chains an object whose ``chains`` has them."""
-    several = [comparison_json(one) for one in comparisons]
+    """A comparison as plain data; several of them as an object with the key ``chains``."""
+    several = [comparison_json(comparison) for comparison in comparisons]
     return several[0] if len(several) == 1 else {"format": JSON_FORMAT, "chains": several}
 
 
 def latency_table(measurement: Measurement) -> ResultTable:
-    """End-to-end latency: at publication and at the subscriber, all cycles and undisturbed ones.
+    """Make a table of end-to-end latency, at the publication and at the subscriber.
 
-    Where the machine was not watched, no cycle is called undisturbed.
+    There are columns of all cycles, and, if the machine was watched, of undisturbed ones.
     """
     analysis = measurement.analysis
     columns: dict[str, LatencyStatistics | None] = {
@@ -147,18 +157,21 @@ def latency_table(measurement: Measurement) -> ResultTable:
         "…undisturbed": analysis.subscriber_undisturbed,
     }
     if measurement.longest_stall_ns is None:
-        columns = dict([*columns.items()][::2])
+        columns = {
+            "all cycles": analysis.statistics,
+            "at the subscriber": analysis.subscriber,
+        }
     title = f"End-to-end latency of {analysis.chain.spec} [ms]"
     table = ResultTable(title, [*words(""), *figures(*columns)], measurement.left_out.text)
     for name, cells in _rows([*columns.values()]).items():
-        # Without a plan no output is due at any time: its period is what there is to compare with.
+        # Without a plan outputs are not due at any instant; late means longer than the period.
         title = "longer than the period" if name == LATE[0] and measurement.plan is None else name
         table.add(title, *cells, detail=title in ("median", "99th percentile"))
     return table
 
 
 def doubts_text(measurement: Measurement) -> str:
-    """What a measurement leaves in doubt: disturbed, incomplete, late and lost, in one line."""
+    """Text, in one line: how many cycles were disturbed, incomplete, late or dropped."""
     analysis = measurement.analysis
     parts = [f"{counted(analysis.statistics.disturbed, 'cycle')} disturbed by the machine"]
     if measurement.longest_stall_ns is None:
@@ -176,10 +189,10 @@ def doubts_text(measurement: Measurement) -> str:
 
 
 def comparison_table(comparison: Comparison, names: Sequence[str] = ()) -> ResultTable:
-    """The same figures of every recording beside each other, usually before and after shaping.
+    """Make a table of several recordings beside each other, usually before and after shaping.
 
-    ``names`` tell the recordings apart; their folders' names do otherwise. The terminal has the
-    figures of undisturbed cycles, and of all cycles those that disturbed ones change.
+    ``names`` are those of the recordings; without them the names of their folders. On the terminal
+    the table has the figures of undisturbed cycles, and of all cycles only the rows ``LATE``.
     """
     measurements = comparison.measurements
     analyses = [measurement.analysis for measurement in measurements]
@@ -196,28 +209,39 @@ def comparison_table(comparison: Comparison, names: Sequence[str] = ()) -> Resul
 
     # Where the machine was not watched, no cycle is called undisturbed.
     watched = any(measurement.longest_stall_ns is not None for measurement in measurements)
-    every, calm = {"median", "99th percentile", "cycles"}, {"came late"}
+    details_of_all, details_of_calm = {"median", "99th percentile", "cycles"}, {"came late"}
     titles = set(_rows([]))
     for place, undisturbed, field, brief in (
         ("publication", "undisturbed", "statistics", set(LATE)),
         ("the subscriber's callback", "subscriber_undisturbed", "subscriber", set[str]()),
     ):
         if watched:
-            columns = [getattr(one, undisturbed) for one in analyses]
-            left_out = [one.statistics.disturbed for one in analyses]
-            without = f" (without {' / '.join(map(str, left_out))} disturbed)" * any(left_out)
-            add(f"at {place}, undisturbed cycles{without} [ms]", columns, every | calm)
-        columns = [getattr(one, field) for one in analyses]
-        add(f"at {place}, all complete cycles [ms]", columns, titles - brief if watched else every)
+            columns = [getattr(analysis, undisturbed) for analysis in analyses]
+            left_out = [analysis.statistics.disturbed for analysis in analyses]
+            without = f" (without {' / '.join(map(str, left_out))} disturbed)"
+            without = without if any(left_out) else ""
+            add(
+                f"at {place}, undisturbed cycles{without} [ms]",
+                columns,
+                details_of_all | details_of_calm,
+            )
+        columns = [getattr(analysis, field) for analysis in analyses]
+        add(
+            f"at {place}, all complete cycles [ms]",
+            columns,
+            titles - brief if watched else details_of_all,
+        )
     table.group("cycles")
     for title, cells in _counts(measurements).items():
         table.add(title, *cells, detail=title == "begun without publishing")
     remarks = [
-        f"{m.recording.path.name}: {m.left_out.text}" for m in measurements if m.left_out.text
+        f"{measurement.recording.path.name}: {measurement.left_out.text}"
+        for measurement in measurements
+        if measurement.left_out.text
     ]
     if comparison.remark:
         remarks.append(comparison.remark)
-    planned = [m.plan for m in measurements if m.plan is not None]
+    planned = [measurement.plan for measurement in measurements if measurement.plan is not None]
     if planned:
         remarks.append(
             f"planned: slots {slots_ms(*publish_slots(planned[-1]))};"
@@ -228,36 +252,36 @@ def comparison_table(comparison: Comparison, names: Sequence[str] = ()) -> Resul
 
 
 def expected_text(plan: ChainPlan) -> str:
-    """What a plan's outputs will look like, in ms."""
+    """Text: when a plan's outputs will leave, in ms."""
     seen, predicted = expected(plan), plan.predicted
     if seen is None:
         figures = map(milliseconds, (predicted.mean_ns, predicted.max_ns, predicted.jitter_ns))
         return "expected average {}, maximum {}, jitter {} at most".format(*figures)
     places = ", ".join(map(milliseconds, seen.leave_ns))
     average = f", average {milliseconds(seen.mean_ns)}" if len(seen.leave_ns) > 1 else ""
-    if average and plan.evidence.interference_ns:  # as far as other chains delay it
+    if average and plan.evidence.interference_ns:  # by how far other chains delay it
         average += f" to {milliseconds(predicted.mean_ns)}"
     return f"outputs leave at {places}{average}"
 
 
 def expected_jitter_text(plan: ChainPlan) -> str:
-    """What :func:`expected_text` says, and the jitter that is expected of it: within each band."""
+    """The text of :func:`expected_text`, with the jitter that is expected within each band."""
     seen, slots = expected(plan), publish_slots(plan)
     if seen is None:
         return expected_text(plan)
     if len(slots) == 1 or plan.modes is not None:
         return f"{expected_text(plan)}; expected jitter {milliseconds(seen.jitter_ns, 1)}"
     within = (jitter_within_band(plan, slot, last=slot == slots[-1]) for slot in slots)
-    jitters = ", ".join(milliseconds(one, 1) for one in within)
+    jitters = ", ".join(milliseconds(jitter_ns, 1) for jitter_ns in within)
     return f"{expected_text(plan)}; jitter within bands at most {jitters}"
 
 
-def verdict(one: Measurement) -> tuple[bool | None, str]:
-    """Whether a recording has what its plan promised (None: nothing to judge), in a sentence."""
-    judged, name = one.prediction, one.recording.path.name
-    if judged is None or one.plan is None:
+def verdict(measurement: Measurement) -> tuple[bool | None, str]:
+    """Judge whether a recording has what its plan promised (None: it cannot be judged); say why."""
+    judged, name = measurement.prediction, measurement.recording.path.name
+    if judged is None or measurement.plan is None:
         return None, f"{name}: no plan was in force, so nothing was promised"
-    effect = stall_effect(one)
+    effect = stall_effect(measurement)
     aside = "" if effect is None else f"; {effect}"
     if judged.broken:
         return False, f"{name}: promise broken: {'; '.join(judged.broken)}{aside}"
@@ -267,29 +291,31 @@ def verdict(one: Measurement) -> tuple[bool | None, str]:
     if (received := judged.receivers) is not None:
         met += f"; received with jitter {ms(received.jitter_ns)} ms, at most"
         met += f" {milliseconds(received.predicted_jitter_ns)} ms"
-    return True, f"{met} ({expected_text(one.plan)}){aside}"
+    return True, f"{met} ({expected_text(measurement.plan)}){aside}"
 
 
-def stall_effect(one: Measurement) -> str | None:
-    """What stalls of the machine did to a chain's figures at publication, and what these are
-    without the cycles that they disturbed; None where no stall was seen.
+def stall_effect(measurement: Measurement) -> str | None:
+    """Text: a chain's figures at publication with, and without, the cycles that stalls disturbed.
+
+    None: no stall was seen.
     """
-    every, calm = one.analysis.statistics, one.analysis.undisturbed
-    if not one.longest_stall_ns:
+    all_cycles, calm = measurement.analysis.statistics, measurement.analysis.undisturbed
+    if not measurement.longest_stall_ns:
         return None
-    longest = duration_text(round(one.longest_stall_ns, -5) or one.longest_stall_ns)
-    said = f"stalls of the machine, {longest} at most, disturbed"
-    if not every.disturbed:
-        return f"{said} no cycle"
-    kinds = (("with these", every), ("without them", calm))
-    bands = 1 if one.plan is None else len(publish_slots(one.plan))
+    longest = duration_text(round(measurement.longest_stall_ns, -5) or measurement.longest_stall_ns)
+    stalls = f"stalls of the machine, {longest} at most, disturbed"
+    if not all_cycles.disturbed:
+        return f"{stalls} no cycle"
+    kinds = (("with these", all_cycles), ("without them", calm))
+    bands = 1 if measurement.plan is None else len(publish_slots(measurement.plan))
     figures = "; ".join(f"{kind} {_brief(statistics, bands)}" for kind, statistics in kinds)
-    return f"{said} {every.disturbed} of {every.count} cycles: {figures}"
+    return f"{stalls} {all_cycles.disturbed} of {all_cycles.count} cycles: {figures}"
 
 
 def _brief(statistics: LatencyStatistics, bands: int) -> str:
-    """Jitter, spread and late outputs in a few words; of several bands the longest latency, since
-    what lies between bands is no jitter.
+    """Jitter, spread and late outputs in a few words.
+
+    If there are several bands, the longest latency: the distance between bands is no jitter.
     """
     late = "" if statistics.late is None else f", {statistics.late} late"
     if bands > 1:
@@ -298,72 +324,88 @@ def _brief(statistics: LatencyStatistics, bands: int) -> str:
 
 
 def _counts(measurements: Sequence[Measurement]) -> dict[str, list[str]]:
-    """What happened to cycles, a cell for each measurement."""
+    """Make the rows of how many cycles were complete, disturbed, late…, a cell a measurement."""
     columns = []
-    for one in measurements:
-        statistics, info = one.analysis.statistics, one.recording.info
-        watched, open_slots = one.longest_stall_ns is not None, one.into_open_slots
+    for measurement in measurements:
+        statistics, info = measurement.analysis.statistics, measurement.recording.info
+        watched, open_slots = measurement.longest_stall_ns is not None, measurement.into_open_slots
         columns.append(
             {
                 "complete": str(statistics.count),
                 "disturbed by the machine": str(statistics.disturbed) if watched else "not watched",
-                "incomplete": counts(one.analysis.incomplete),
-                "too late for their slot": counts(one.overruns, "not gated"),
-                "next cycle hit": next_cycles(one.outcomes) if one.outcomes else ABSENT,
+                "incomplete": counts(measurement.analysis.incomplete),
+                "too late for their slot": counts(measurement.overruns, "not gated"),
+                "next cycle hit": next_cycles(measurement.outcomes)
+                if measurement.outcomes
+                else ABSENT,
                 "arrived during their slot": "not gated" if open_slots is None else str(open_slots),
-                "messages lost at the gate": counts(one.dropped, "not gated"),
-                "begun without publishing": str(one.analysis.silent),
-                "longest stall of the machine [ms]": ms(one.longest_stall_ns),
+                "messages lost at the gate": counts(measurement.dropped, "not gated"),
+                "begun without publishing": str(measurement.analysis.silent),
+                "longest stall of the machine [ms]": ms(measurement.longest_stall_ns),
                 "lost while recording": str(sum(info.lost.values())),
                 "real-time scheduling": YES_NO.get(info.realtime, ABSENT),
             }
         )
-    rows = {title: [own[title] for own in columns] for title in columns[0]}
-    moves = [moves_in(one.analysis) for one in measurements]
+    rows = {title: [column[title] for column in columns] for title in columns[0]}
+    moves = [moves_in(measurement.analysis) for measurement in measurements]
     if any(moves):
-        rows["slots followed latencies"] = [moves_text(own) if own else ABSENT for own in moves]
+        rows["slots followed latencies"] = [
+            moves_text(moves_of_recording) if moves_of_recording else ABSENT
+            for moves_of_recording in moves
+        ]
     return rows
 
 
 def headline(names: Sequence[str], measurements: Sequence[Measurement]) -> str:
-    """What a reader remembers: the jitter and the average before and after, and whether they are
-    as the plan predicted, of undisturbed cycles, at publication; and what stalls did to the last.
+    """The sentence that a reader remembers: jitter and average before and after.
+
+    At publication, of undisturbed cycles. With whether they are as the plan predicted, and what
+    stalls did to the last recording.
     """
-    calm = [one.analysis.undisturbed for one in measurements]
+    calm = [measurement.analysis.undisturbed for measurement in measurements]
     ends = [0, -1] if len(calm) > 1 else [0]
     jitter, average = (
         " → ".join(f"{ms(getattr(calm[n], field))} ms ({names[n]})" for n in ends)
         for field in ("jitter_ns", "mean_ns")
     )
-    said, judged = f"Jitter {jitter}; average {average}", measurements[-1].prediction
+    text, judged = f"Jitter {jitter}; average {average}", measurements[-1].prediction
     effect = stall_effect(measurements[-1])
     aside = f" {effect[0].upper()}{effect[1:]}." if effect is not None else ""
     if judged is None:
-        return f"{said}.{aside}"
+        return f"{text}.{aside}"
     if judged.broken:
-        return f"{said}; differs from the prediction: {'; '.join(judged.broken)}.{aside}"
-    holds = {one.holds for one in (judged.mean, judged.max, judged.jitter)}
+        return f"{text}; differs from the prediction: {'; '.join(judged.broken)}.{aside}"
+    holds = {figure.holds for figure in (judged.mean, judged.max, judged.jitter)}
     verdict = "not judged" if holds == {None} else "as predicted"
-    return f"{said}; {verdict}, {judged.outputs.text}.{aside}"
+    return f"{text}; {verdict}, {judged.outputs.text}.{aside}"
 
 
 def overview_table(comparisons: Sequence[Comparison], names: Sequence[str] = ()) -> ResultTable:
-    """One row per chain of an application, each recording's figures of undisturbed cycles."""
-    names = names or [one.recording.path.name for one in comparisons[0].measurements]
+    """Make a table of an application's chains: each recording's figures of undisturbed cycles."""
+    names = names or [
+        measurement.recording.path.name for measurement in comparisons[0].measurements
+    ]
     fields = {"jitter": "jitter_ns", "average": "mean_ns", "maximum": "max_ns"}
     titles = [f"{title}\n{name}" for title in (*fields, "missed of all") for name in names]
     table = ResultTable("At publication [ms]", [*words("chain"), *figures(*titles)])
     for chain in comparisons:
-        found = [one.analysis for one in chain.measurements]
-        times = (getattr(one.undisturbed, field) for field in fields.values() for one in found)
-        outputs = (outputs_due(one.analysis, one.plan) for one in chain.measurements)
-        missed = (ABSENT if one.late is None and not one.missed else one.missed for one in outputs)
+        analyses = [measurement.analysis for measurement in chain.measurements]
+        times = (
+            getattr(analysis.undisturbed, field)
+            for field in fields.values()
+            for analysis in analyses
+        )
+        outputs = (
+            outputs_due(measurement.analysis, measurement.plan)
+            for measurement in chain.measurements
+        )
+        missed = (ABSENT if due.late is None and not due.missed else due.missed for due in outputs)
         table.add(chain.chain, *map(ms, times), *missed)
     return table
 
 
 def prediction_table(judged: JudgedPrediction, name: str = "") -> ResultTable:
-    """Predicted beside measured: the whole, then band by band; of a recording with a ``name``."""
+    """Make a table of predicted beside measured figures: of all cycles, then of each band."""
     whence = ", from the start of the cycle" if judged.counted_from == "cycle" else ""
     columns = [*words(""), *figures("predicted", "measured"), *words("verdict")]
     columns += figures("jitter", "share predicted", "measured")
@@ -406,14 +448,14 @@ def prediction_table(judged: JudgedPrediction, name: str = "") -> ResultTable:
 
 
 def late_text(judged: JudgedPrediction) -> str:
-    """How many outputs that were due came late or never, no cycle left out."""
+    """Text: how many outputs that were due came late or never, of all cycles."""
     disturbed = (judged.outputs.late or 0) - judged.late
     among = f", {disturbed} of the late ones in disturbed cycles" if disturbed else ""
     return f"of all cycles: {judged.outputs.text}{among}"
 
 
 def prediction_json(judged: JudgedPrediction) -> dict[str, Any]:
-    """The same as plain data, integers in nanoseconds."""
+    """A judged prediction as plain data, in whole nanoseconds."""
 
     def plain(figure: JudgedFigure) -> dict[str, Any]:
         return {name.removesuffix("_ns"): value for name, value in vars(figure).items()}
@@ -438,16 +480,16 @@ def prediction_json(judged: JudgedPrediction) -> dict[str, Any]:
 
 
 def breakdown_json(analysis: LatencyAnalysis) -> dict[str, Any]:
-    """The breakdown as plain data: ``hops``, and the parts' shares of the mean latency."""
+    """The breakdown by hops as plain data, with the parts' shares of the mean latency."""
     frame = hop_breakdown(analysis)
     shares = {f"{part}_share": share for part, share in part_shares(frame).items()}
     return {"hops": frame.to_dicts(), **shares}
 
 
 def breakdown_table(analysis: LatencyAnalysis) -> ResultTable:
-    """Every hop's communication, computation and waiting, and their shares of the mean latency.
+    """Make a table of each hop's communication, computation and waiting, with their shares.
 
-    Where no message waits in a node, that has no columns.
+    If no message waits in a node, there are no columns for waiting.
     """
     frame = hop_breakdown(analysis)
     waits = frame["waiting_ns"].struct.field("max").fill_null(0).max()
@@ -468,7 +510,7 @@ def breakdown_table(analysis: LatencyAnalysis) -> ResultTable:
 
 
 def incomplete_table(names: Sequence[str], measurements: Sequence[Measurement]) -> ResultTable:
-    """Why cycles have no latency, with the first cycles' numbers; no row where all have one."""
+    """Make a table of why cycles have no latency, with the numbers of the first ones."""
     table = ResultTable("", [*words("", "reason", "at"), *figures("cycles", "numbers")])
     for name, measurement in zip(names, measurements, strict=True):
         broken = measurement.analysis.traversals.drop_nulls("reason")

@@ -1,5 +1,8 @@
-"""What there is, in rows and as plain data: in a recording (events, callbacks, chains, stalls), on
-a machine (abilities, threads), in a plan (slots, bands, figure 7's curve), in force, in a sweep."""
+"""Overviews as tables and as plain data.
+
+They show a recording (events, callbacks, chains, stalls), a machine (abilities, threads), a plan
+(slots, bands, figure 7's curve), runs in force, a watch, budgets, and a sweep.
+"""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -48,15 +51,15 @@ from chainshaper.values.recording import (
 )
 from chainshaper.verify.measure import PARTS, Measurement
 
-if TYPE_CHECKING:  # only their verbs import them
+if TYPE_CHECKING:  # only the verbs `watch` and `budget` need these modules
     from chainshaper.monitor.budgets import Judged
     from chainshaper.monitor.watch import Seen
 
 UNKNOWN = "unknown"
 COLOURS = {"good": "green", "limited": "yellow", "absent": "red"}
-MOST_ROWS = 50
-MOST_SLOTS = 8
-SWEEP_FIGURES = {
+MOST_ROWS = 50  # points of a sweep that a table shows
+MOST_SLOTS = 8  # slots of a server that a table shows
+SWEEP_FIGURES = {  # column of a sweep's frame → title
     "mean_ns": "average",
     "max_ns": "maximum",
     "jitter_ns": "jitter",
@@ -71,11 +74,10 @@ PROMISE = {True: "met", False: "broken", None: ABSENT}
 def contents_json(
     recording: Recording, contradictions: Sequence[Contradiction] = ()
 ) -> dict[str, Any]:
-    """Counts per event, what was lost, the clock, the system that was recorded, and the
-    ``contradictions`` among its events."""
+    """Describe a recording: counts per event, events lost, clock offset, system, contradictions."""
     info = recording.info
     notes = list(info.notes)
-    # A recording from before there were checksums; a tracer's trace never has any.
+    # Older recordings have no checksums. A tracer's trace never has any, and needs no note.
     if info.checksums is None and (recording.path / INFO_FILE).is_file():
         notes.append(
             "this recording has no checksums, so that damage to its files may go unseen:"
@@ -97,7 +99,7 @@ def contents_json(
 
 
 def contents_table(recording: Recording) -> tuple[ResultTable, ResultTable]:
-    """The system that was recorded, and how often each event happened."""
+    """Make two tables of a recording: its system, and how often each event happened."""
     contents = contents_json(recording)
     system = ResultTable(str(recording.path), words("", ""))
     for title, value in (
@@ -118,18 +120,19 @@ def contents_table(recording: Recording) -> tuple[ResultTable, ResultTable]:
 
 
 def callback_rows(statistics: pl.DataFrame) -> list[dict[str, Any]]:
-    """Callback statistics as plain data: response and execution times in ns; ``pid`` is the last
-    of ``pids``, the processes of a node that was started again; ``declared_ns`` is a timer's
-    declared period, ``period_ns`` that of its starts."""
+    """Callback statistics as plain data, with some of the columns of ``callback_statistics``.
+
+    See :func:`~chainshaper.analysis.latency.callback_statistics`.
+    """
     columns = ("node", "kind", "topic", "period_ns", "declared_ns", "pid", "pids", "tids", "count")
     return statistics.select(*columns, "response_ns", "execution_ns").to_dicts()
 
 
 def callback_table(statistics: pl.DataFrame) -> ResultTable:
-    """Every callback: its thread, how often it ran, and its execution and response times.
+    """Make a table of callbacks: threads, number of instances, execution and response times.
 
-    Execution times have columns only where there are any. A function's name has a column in the
-    report; on the terminal it stands behind callbacks that nothing else tells apart.
+    Execution and response times have columns only where there are any. The name of the function has
+    a column in the report. On the terminal it stands behind callbacks that look alike without it.
     """
     measured = [name for name in ("execution", "response") if statistics[f"{name}_ns"].count()]
     columns = [*words("node", "callback"), Column("function", words=True, detail=True)]
@@ -151,17 +154,18 @@ def callback_table(statistics: pl.DataFrame) -> ResultTable:
     return table
 
 
-def chains_json(graph: ApplicationGraph, found: ChainEnumeration) -> dict[str, Any]:
-    """``count`` chains (a lower bound unless ``exact``), those listed, and the heaviest."""
+def chains_json(graph: ApplicationGraph, enumeration: ChainEnumeration) -> dict[str, Any]:
+    """The number of chains (unless ``exact``, a lower bound), those listed, and the heaviest."""
     heaviest = None
-    if found.heaviest is not None:
-        heaviest = {**_chain(graph, found.heaviest), "response_ns": found.heaviest_ns}
-    chains = [_chain(graph, chain) for chain in found.chains]
-    known = {name: getattr(found, name) for name in ("count", "exact", "complete")}
+    if enumeration.heaviest is not None:
+        heaviest = {**_chain(graph, enumeration.heaviest), "response_ns": enumeration.heaviest_ns}
+    chains = [_chain(graph, chain) for chain in enumeration.chains]
+    known = {name: getattr(enumeration, name) for name in ("count", "exact", "complete")}
     return {**known, "heaviest": heaviest, "chains": chains}
 
 
 def _chain(graph: ApplicationGraph, chain: Chain) -> dict[str, Any]:
+    """A chain as plain data."""
     path = graph.path(chain)
     return {
         "chain": chain.spec,
@@ -171,61 +175,70 @@ def _chain(graph: ApplicationGraph, chain: Chain) -> dict[str, Any]:
     }
 
 
-def count_text(found: ChainEnumeration) -> str:
+def count_text(enumeration: ChainEnumeration) -> str:
     """How many chains there are, and how many of them are listed."""
-    number = f"{'' if found.exact else 'at least '}{counted(found.count, 'chain')}"
-    return number if found.complete else f"{number}, {len(found.chains)} of them listed"
+    number = counted(enumeration.count, "chain")
+    if not enumeration.exact:
+        number = f"at least {number}"
+    return number if enumeration.complete else f"{number}, {len(enumeration.chains)} of them listed"
 
 
-def chain_table(graph: ApplicationGraph, found: ChainEnumeration) -> ResultTable:
-    """One row per chain: where it starts, which topics it passes; the heaviest is marked."""
+def chain_table(graph: ApplicationGraph, enumeration: ChainEnumeration) -> ResultTable:
+    """Make a table of chains: where each starts, the topics it passes; the heaviest is marked."""
     columns = [*words("starts at", "topics"), *figures("heaviest [ms]")]
     table = ResultTable("Computation chains", columns)
-    for chain in dict.fromkeys(filter(None, (*found.chains, found.heaviest))):
+    for chain in dict.fromkeys(filter(None, (*enumeration.chains, enumeration.heaviest))):
         row = _chain(graph, chain)
-        heaviest = chain == found.heaviest and found.heaviest_ns is not None
-        weight = milliseconds(found.heaviest_ns or 0) if heaviest else ""
+        heaviest = chain == enumeration.heaviest and enumeration.heaviest_ns is not None
+        weight = milliseconds(enumeration.heaviest_ns or 0) if heaviest else ""
         table.add(row["callbacks"][0], " → ".join(row["topics"]), weight)
     return table
 
 
 def threads_json(allocation: Allocation) -> dict[str, Any]:
-    """The threads of a running application, and what is not certain about them."""
+    """The threads of a running application as plain data, and notes on what is not certain."""
     rows = [
         {
-            "nodes": list(found.nodes),
-            "nodes_known_by": found.nodes_known_by or None,
-            **{name: getattr(found.thread, name) for name in ("pid", "tid", "comm", "role")},
-            "callbacks": [{"node": node, "callback": name} for node, name in found.callbacks],
-            "dds_kind": found.thread.kind,
-            "known_by": found.known_by or None,
-            "policy": found.thread.policy,
-            "priority": found.thread.priority,
-            "cores": list(found.thread.cores),
+            "nodes": list(listed_thread.nodes),
+            "nodes_known_by": listed_thread.nodes_known_by or None,
+            **{
+                name: getattr(listed_thread.thread, name) for name in ("pid", "tid", "comm", "role")
+            },
+            "callbacks": [
+                {"node": node, "callback": name} for node, name in listed_thread.callbacks
+            ],
+            "dds_kind": listed_thread.thread.kind,
+            "known_by": listed_thread.known_by or None,
+            "policy": listed_thread.thread.policy,
+            "priority": listed_thread.thread.priority,
+            "cores": list(listed_thread.thread.cores),
         }
-        for found in allocation.threads
+        for listed_thread in allocation.threads
     ]
     return {"threads": rows, "notes": list(allocation.notes)}
 
 
 def threads_table(allocation: Allocation) -> ResultTable:
-    """A row per thread; what is as in the row above is left out."""
+    """Make a table of threads; node and process are left out where the row above has the same."""
     columns = words("node", "pid", "tid", "name", "role", "class", "cores", "known by")
     table = ResultTable("Threads", columns)
-    above: NodeThread | None = None
-    for found in allocation.threads:
-        thread = found.thread
-        first = above is None or above.thread.pid != thread.pid
-        same_nodes = not first and above is not None and above.nodes == found.nodes
-        known_by, names = [found.known_by or "-"], [name for _, name in found.callbacks]
-        if first and found.nodes:
-            known_by.append(f"node: {found.nodes_known_by or None}")
+    row_above: NodeThread | None = None
+    for listed_thread in allocation.threads:
+        thread = listed_thread.thread
+        first = row_above is None or row_above.thread.pid != thread.pid
+        same_nodes = not first and row_above is not None and row_above.nodes == listed_thread.nodes
+        known_by, names = (
+            [listed_thread.known_by or "-"],
+            [name for _, name in listed_thread.callbacks],
+        )
+        if first and listed_thread.nodes:
+            known_by.append(f"node: {listed_thread.nodes_known_by or None}")
         role = f"DDS {thread.kind}" if thread.role == "dds" else ", ".join((thread.role, *names))
         scheduling = scheduling_text(thread.policy, thread.priority), core_ranges(thread.cores)
-        nodes = "" if same_nodes else ", ".join(found.nodes) or UNKNOWN
-        who = thread.pid if first else "", thread.tid, thread.comm
-        table.add(nodes, *who, role, *scheduling, "; ".join(known_by))
-        above = found
+        nodes = "" if same_nodes else ", ".join(listed_thread.nodes) or UNKNOWN
+        numbers = thread.pid if first else "", thread.tid, thread.comm
+        table.add(nodes, *numbers, role, *scheduling, "; ".join(known_by))
+        row_above = listed_thread
     return table
 
 
@@ -252,11 +265,11 @@ def machine_json(report: MachineReport) -> dict[str, Any]:
 
 
 def machine_tables(report: MachineReport) -> tuple[ResultTable, ResultTable]:
-    """What the machine can do, and how it stalls."""
+    """Make two tables of a machine: what it can do, and its stalls."""
     abilities = ResultTable("This machine", words("", "found", "for", "remedy"))
     for check in report.checks:
-        found = plain(check.found, COLOURS[check.state])
-        abilities.add(check.name, found, check.needed_for, check.remedy)
+        finding = plain(check.found, COLOURS[check.state])
+        abilities.add(check.name, finding, check.needed_for, check.remedy)
     threshold = duration_text(report.stall_meter.threshold_ns)
     stalls = stall_table(report.stall_meter, report.stalls)
     stalls.title = f"Stalls longer than {threshold} in {duration_text(report.watched_ns)}"
@@ -266,17 +279,20 @@ def machine_tables(report: MachineReport) -> tuple[ResultTable, ResultTable]:
 
 
 def stall_rows(meter: StallMeterInfo, stalls: pl.DataFrame) -> list[dict[str, Any]]:
-    """Per core: stalls seen, of the columns ``cpu, duration``; their total and longest (ns)."""
+    """Count the stalls of each core; sum their durations and find the longest (ns).
+
+    ``stalls`` has the columns ``cpu, duration`` (ns).
+    """
     rows = []
     for core, usual in zip(meter.cores, meter.median_lateness_ns, strict=True):
-        own = stalls.filter(cpu=core)["duration"].to_list()
-        row = {"core": core, "count": len(own), "longest_ns": max(own, default=0)}
-        rows.append({**row, "total_ns": sum(own), "median_wakeup_ns": usual})
+        durations = stalls.filter(cpu=core)["duration"].to_list()
+        row = {"core": core, "count": len(durations), "longest_ns": max(durations, default=0)}
+        rows.append({**row, "total_ns": sum(durations), "median_wakeup_ns": usual})
     return rows
 
 
 def stall_table(meter: StallMeterInfo, stalls: pl.DataFrame) -> ResultTable:
-    """Stalls per core, and the longest."""
+    """Make a table of the stalls of each core."""
     titles = ("stalls", "in all [ms]", "longest [ms]", "usual wake-up [µs]")
     table = ResultTable("", [*words(""), *figures(*titles)])
     for row in stall_rows(meter, stalls):
@@ -290,18 +306,21 @@ def stall_table(meter: StallMeterInfo, stalls: pl.DataFrame) -> ResultTable:
 def condition_table(
     names: Sequence[str], recordings: Sequence[Sequence[Measurement]]
 ) -> ResultTable:
-    """How each recording was taken, a column for each: what makes its figures believable.
+    """Make a table of how each recording was taken, a column for each.
 
     A recording has a measurement for each of its chains.
     """
     columns = []
-    for one, *others in recordings:
-        info, plans = one.recording.info, [m.plan for m in (one, *others) if m.plan is not None]
+    for first, *further in recordings:
+        info, plans = (
+            first.recording.info,
+            [measurement.plan for measurement in (first, *further) if measurement.plan is not None],
+        )
         in_force = "\n".join(map(_in_force, plans))
         columns.append(
             {
-                "folder": str(one.recording.path),
-                "first cycle": _begun(one),
+                "folder": str(first.recording.path),
+                "first cycle": _begun(first),
                 "source": info.source,
                 "host": info.host,
                 "kernel": info.kernel,
@@ -311,26 +330,26 @@ def condition_table(
                 "real-time scheduling": YES_NO.get(info.realtime),
                 "scheduling in force": _scheduling(info.threads),
                 "machine watched for stalls": _watched(info.stall_meter),
-                "events": f"{event_counts(one.recording)['count'].sum():,}",
+                "events": f"{event_counts(first.recording)['count'].sum():,}",
                 "events lost": lost_text(info.lost).partition(": ")[2],
                 "plan in force": in_force or "none",
             }
         )
     table = ResultTable("", words("", *names))
     for title in columns[0]:
-        table.add(title, *(own[title] or UNKNOWN for own in columns))
+        table.add(title, *(column[title] or UNKNOWN for column in columns))
     return table
 
 
 def _in_force(plan: ChainPlan) -> str:
-    """A plan in one line, with what its servers do at their slots' ends."""
+    """A plan in one line: its policy, whether servers close behind their slots, its chain."""
     closing = "servers closed behind their slots" if plan.slot_ends == "closed" else ""
     parts = [part for part in (plan.policy, closing) if part]
     return f"{', '.join(parts)}, for {plan.chain.spec or 'a chain'}"
 
 
 def _begun(measurement: Measurement) -> str:
-    """When the first cycle began, and for how long cycles went on beginning."""
+    """Text: when the first cycle began, how many there are, and the time from first to last."""
     starts = measurement.analysis.traversals["start"]
     if not len(starts):
         return "none"
@@ -341,7 +360,10 @@ def _begun(measurement: Measurement) -> str:
 
 
 def _scheduling(threads: Iterable[ThreadInfo]) -> str:
-    kinds = Counter((one.role, one.policy, one.priority, one.cores) for one in threads)
+    """How many threads of each role have which scheduling and cores, a line each."""
+    kinds = Counter(
+        (thread.role, thread.policy, thread.priority, thread.cores) for thread in threads
+    )
     return "\n".join(
         f"{role}: {policy} {priority}, {cores_text(cores)} ({number})"
         for (role, policy, priority, cores), number in sorted(kinds.items())
@@ -354,36 +376,41 @@ def cores_text(cores: Sequence[int]) -> str:
 
 
 def _watched(meter: StallMeterInfo | None) -> str:
+    """How the machine was watched for stalls."""
     if meter is None:
         return "no: disturbed cycles are not known"
-    own = "" if meter.realtime else ", itself open to pre-emption"
+    open = "" if meter.realtime else ", itself open to pre-emption"
     return (
-        f"every {meter.period_ns / 1e6:g} ms on {cores_text(meter.cores)}{own}; stalls from "
+        f"every {meter.period_ns / 1e6:g} ms on {cores_text(meter.cores)}{open}; stalls from "
         f"{meter.threshold_ns / 1e6:g} ms"
     )
 
 
 def recorded_thread_table(threads: Sequence[ThreadInfo]) -> ResultTable:
-    """The threads of a recorded application, as the kernel reported them."""
+    """Make a table of a recorded application's threads, as the kernel reported them."""
     columns = [*words("node", "thread", "role"), *figures("pid", "tid")]
     table = ResultTable("", [*columns, *words("scheduling"), *figures("cores")])
-    for one in sorted(threads, key=lambda thread: (thread.node, thread.tid)):
-        scheduling = f"{one.policy} {one.priority}", listed(one.cores)
-        table.add(one.node, one.comm, one.role, one.pid, one.tid, *scheduling)
+    for recorded in sorted(threads, key=lambda thread: (thread.node, thread.tid)):
+        scheduling = f"{recorded.policy} {recorded.priority}", listed(recorded.cores)
+        table.add(
+            recorded.node, recorded.comm, recorded.role, recorded.pid, recorded.tid, *scheduling
+        )
     return table
 
 
 def plan_table(plan: ChainPlan) -> ResultTable:
-    """Servers and slots of a plan."""
+    """Make a table of a plan's servers, their slots and threads."""
     columns = [*words("server"), *figures("core", "priority"), *words("slots", "threads")]
     table = ResultTable(f"Plan for {plan.chain.spec or 'a chain'} [ms]", columns)
-    for one in plan.servers:
+    for server in plan.servers:
         threads = []
-        for thread in one.threads:
+        for thread in server.threads:
             publishes = thread.role == "publisher"
-            what = "publisher" if publishes else ", ".join(thread.callbacks)
-            threads.append(f"{thread.node} ({what})" if what else thread.node)
-        table.add(one.name, one.core, one.priority, slots_ms(*one.slots), ", ".join(threads))
+            role = "publisher" if publishes else ", ".join(thread.callbacks)
+            threads.append(f"{thread.node} ({role})" if role else thread.node)
+        table.add(
+            server.name, server.core, server.priority, slots_ms(*server.slots), ", ".join(threads)
+        )
     offset = f", offset {milliseconds(plan.offset_ns)}" if plan.offset_ns else ""
     table.caption = f"cycle {milliseconds(plan.cycle_ns)}{offset}; {expected_jitter_text(plan)}"
     if (received := receivers_text(plan)) is not None:
@@ -392,24 +419,26 @@ def plan_table(plan: ChainPlan) -> ResultTable:
 
 
 def receivers_text(plan: ChainPlan) -> str | None:
-    """What a plan promises for those that receive its output, and where they run."""
+    """Text: where the receivers of a plan's output run, and what the plan promises them."""
     node, promised = plan.shaping_node, plan.predicted.receivers
     if node is None or node.receivers_at is None or promised is None:
         return None
-    said = f"{', '.join(node.receivers)} on core {node.receivers_at.core}: callbacks start by"
-    said += f" {milliseconds(promised.max_ns)}, jitter"
-    return f"{said} {milliseconds(promised.jitter_ns)} at most"
+    text = f"{', '.join(node.receivers)} on core {node.receivers_at.core}: callbacks start by"
+    text += f" {milliseconds(promised.max_ns)}, jitter"
+    return f"{text} {milliseconds(promised.jitter_ns)} at most"
 
 
 def bands_table(plan: ChainPlan) -> ResultTable:
-    """What a plan predicts of each latency band, or of each mode by what was measured in it."""
+    """Make a table of a plan's latency bands as predicted, or of its modes and their slots."""
     if plan.modes is not None and plan.evidence.modes is not None:
         columns = [*words("mode"), *figures("cycles", "min", "mean", "max", "slot")]
         table = ResultTable("Modes, as measured, and their slots [ms]", columns)
-        for mode, own in plan.evidence.modes.items():
-            times = map(ms, (own.min_latency_ns, own.mean_latency_ns, own.max_latency_ns))
+        for mode, evidence in plan.evidence.modes.items():
+            times = map(
+                ms, (evidence.min_latency_ns, evidence.mean_latency_ns, evidence.max_latency_ns)
+            )
             slot = publish_slots(plan)[plan.modes.bands[mode] - 1]
-            table.add(mode, f"{own.samples:,}", *times, slots_ms(slot))
+            table.add(mode, f"{evidence.samples:,}", *times, slots_ms(slot))
         return table
     columns = figures("slot", "share of cycles", "jitter at most")
     table = ResultTable("Predicted latency bands [ms]", columns)
@@ -419,7 +448,7 @@ def bands_table(plan: ChainPlan) -> ResultTable:
 
 
 def choice_table(choice: BandChoice) -> ResultTable:
-    """Figure 7 in rows: the average over the number of bands, and where `auto` stops."""
+    """Make a table of figure 7: the average over the number of bands, and where `auto` stops."""
     columns = [*figures("bands", "average", "gain"), *words("slots end at")]
     table = ResultTable("Average over the number of bands [ms]", columns, choice.reason)
     for before, placement in zip((None, *choice.curve), choice.curve, strict=False):
@@ -434,21 +463,21 @@ def choice_table(choice: BandChoice) -> ResultTable:
 
 
 def choice_json(choice: BandChoice) -> dict[str, Any]:
-    """The same as plain data."""
+    """Figure 7 as plain data, as in :func:`choice_table`."""
     curve = [
         {
-            "bands": len(one.slot_ends_ns),
-            "mean_ns": round(one.mean_ns),
-            "bands_ns": list(one.slot_ends_ns),
+            "bands": len(placement.slot_ends_ns),
+            "mean_ns": round(placement.mean_ns),
+            "bands_ns": list(placement.slot_ends_ns),
         }
-        for one in choice.curve
+        for placement in choice.curve
     ]
     chosen = len(choice.chosen.slot_ends_ns)
     return {"curve": curve, "chosen": chosen, "reason": choice.reason}
 
 
 def servers_table(state: RunState) -> ResultTable:
-    """The servers of a run, a row each, with what they have done since they were armed."""
+    """Make a table of a run's servers, with their counters since they were armed."""
     columns = words("server", "core", "priority", "slots", "threads", "enforced by")
     columns += figures("slots opened", "late", "worst", "overruns")
     table = ResultTable(f"{state.plan or 'plan'} in force with {state.back_end}", columns)
@@ -456,15 +485,22 @@ def servers_table(state: RunState) -> ResultTable:
         table.caption = f"cycles of {duration_text(state.cycle_ns)}"
         if state.drift_ns is not None:
             table.caption += f"; the chain's start has drifted by {state.drift_ns / 1e6:+.3f} ms"
-        for move in {one.chain: one for one in state.moves}.values():
+        for move in {latest.chain: latest for latest in state.moves}.values():
             table.caption += f"; {move.text}"
-    for one in state.servers:
-        more = len(one.slots) - MOST_SLOTS  # of several chains, over the hyper-period
-        slots = " ".join(map(slot_text, one.slots[:MOST_SLOTS]))
-        slots += f" and {more} more" if more > 0 else ""
-        threads = listed(one.threads) or "none"
-        about = one.name, one.core, one.priority, slots, threads, one.kept_by
-        table.add(*about, *_counted(one).values())
+    for server in state.servers:
+        slots = " ".join(map(slot_text, server.slots[:MOST_SLOTS]))
+        # A server of several chains has slots over the whole hyper-period.
+        if (more := len(server.slots) - MOST_SLOTS) > 0:
+            slots += f" and {more} more"
+        table.add(
+            server.name,
+            server.core,
+            server.priority,
+            slots,
+            listed(server.threads) or "none",
+            server.kept_by,
+            *_counters(server).values(),
+        )
     return table
 
 
@@ -472,12 +508,14 @@ def run_line(state: RunState) -> str:
     """The state of a run in one line, for where there is no terminal."""
     parts = []
     for server in state.servers:
-        known = [f"{key} {value}" for key, value in _counted(server).items() if value != "-"]
-        parts += [f"{server.name}: {', '.join(known)}"] if known else []
+        known = [f"{key} {value}" for key, value in _counters(server).items() if value != "-"]
+        if known:
+            parts.append(f"{server.name}: {', '.join(known)}")
     return "; ".join(parts) or f"in force with {state.back_end}"
 
 
-def _counted(server: ServerState) -> dict[str, str]:
+def _counters(server: ServerState) -> dict[str, str]:
+    """Texts of a server's counters, by their names; ``-`` where there is none."""
     counters = server.counters
     lateness = counters.longest_lateness_ns
     worst = None if lateness is None else f"{milliseconds(lateness)} ms"
@@ -487,7 +525,7 @@ def _counted(server: ServerState) -> dict[str, str]:
 
 
 def runs_table(runs: Iterable[tuple[Journal, RunState | None]]) -> ResultTable:
-    """Every run on this machine: its plan, back end and owner, and how it is doing."""
+    """Make a table of the runs on this machine: plan, back end, owner and state."""
     table = ResultTable("Plans in force", words("run", "plan", "back end", "owner", "state"))
     for journal, state in runs:
         plan, back_end = (state.plan, state.back_end) if state else ("not known yet", "")
@@ -503,106 +541,128 @@ def runs_table(runs: Iterable[tuple[Journal, RunState | None]]) -> ResultTable:
 
 
 def watch_tables(seen: "Seen") -> list[ResultTable]:
-    """What is to be seen of each chain now: its spans, then its hops."""
+    """Make two tables of each watched chain: latencies over its spans, and its hops."""
     nodes = ", ".join(sorted(filter(None, seen.processes.values()))) or "no node"
     tables = []
-    for one in seen.chains:
-        title = f"{one.chain}: {one.rate_hz:.2f} cycles a second"
-        if one.promised_ns is not None:
-            shares = ", ".join(map(percent, one.shares)) or "no output yet"
-            moved = f", moved by {one.moved_ns / 1e6:+.3f} ms" if one.moved_ns else ""
-            title += f"; the plan's last slot ends at {ms(one.promised_ns)} ms{moved}"
+    for chain in seen.chains:
+        title = f"{chain.chain}: {chain.rate_hz:.2f} cycles a second"
+        if chain.promised_ns is not None:
+            shares = ", ".join(map(percent, chain.shares)) or "no output yet"
+            moved = f", moved by {chain.moved_ns / 1e6:+.3f} ms" if chain.moved_ns else ""
+            title += f"; the plan's last slot ends at {ms(chain.promised_ns)} ms{moved}"
             title += f", in slots: {shares}"
-            if one.shares:
-                others = max(1.0 - one.early - sum(one.shares), 0.0)
-                title += f", before the first: {percent(one.early)}, outside: {percent(others)}"
-        if one.kept is not None:
-            met = "met" if one.kept else "broken"
-            title += f"; promise {met} over the hour: {one.outputs.text},"
-            title += f" {one.outputs.most_missed} at most"
+            if chain.shares:
+                outside = max(1.0 - chain.early - sum(chain.shares), 0.0)
+                title += f", before the first: {percent(chain.early)}, outside: {percent(outside)}"
+        if chain.kept is not None:
+            met = "met" if chain.kept else "broken"
+            title += f"; promise {met} over the hour: {chain.outputs.text},"
+            title += f" {chain.outputs.most_missed} at most"
         names = ("cycles", "min", "p50", "p99", "max", "jitter", "late", "incomplete")
-        table = ResultTable(title, [*words("last [ms]"), *figures(*names)], one.problem)
-        for span, own in one.spans.items():
-            middle = (own.percentiles_ns.get(which) for which in ("50", "99"))
-            times = map(ms, (own.min_ns, *middle, own.max_ns, own.jitter_ns))
-            table.add(span, own.count, *times, own.late, own.incomplete)
+        table = ResultTable(title, [*words("last [ms]"), *figures(*names)], chain.problem)
+        for span, latencies in chain.spans.items():
+            table.add(
+                span,
+                latencies.count,
+                ms(latencies.min_ns),
+                ms(latencies.percentiles_ns.get("50")),
+                ms(latencies.percentiles_ns.get("99")),
+                ms(latencies.max_ns),
+                ms(latencies.jitter_ns),
+                latencies.late,
+                latencies.incomplete,
+            )
         tables.append(table)
-        if one.hops:
+        if chain.hops:
             hops = ResultTable("", [*words("node", "topic"), *figures(*PARTS)])
-            for hop in one.hops:
+            for hop in chain.hops:
                 hops.add(hop.node, hop.topic, *(ms(getattr(hop, f"{part}_ns")) for part in PARTS))
             tables.append(hops)
     lost = f"; {seen.lost} events lost" if seen.lost else ""
-    if unclear := sum(one.counted["unclear"] for one in seen.chains):
+    if unclear := sum(chain.counted["unclear"] for chain in seen.chains):
         lost += f"; {unclear} cycles unclear: the clock was set"
-    if unused := sum(one.counted["not_used"] for one in seen.chains):
+    if unused := sum(chain.counted["not_used"] for chain in seen.chains):
         lost += f"; {unused} messages not used: newer ones were stored"
-    lost += "".join(f"; {one.rstrip('.')}" for one in seen.left_out)
+    lost += "".join(f"; {reason.rstrip('.')}" for reason in seen.left_out)
     problem = tables[-1].caption
     tables[-1].caption = f"{problem}; {nodes}{lost}" if problem else f"{nodes}{lost}"
     return tables
 
 
 def fleet_table(judged: "Sequence[Sequence[Judged]]") -> ResultTable:
-    """How many limits each recording breaks, the worst first, and which comes first."""
+    """Make a table of how many limits each recording breaks, the worst first."""
     columns = [*words("recording"), *figures("limits", "broken"), *words("first of them")]
     table = ResultTable("Recordings against the budget", columns)
-    rows = [(own, [one for one in own if not one.met]) for own in judged if own]
-    for own, broken in sorted(rows, key=lambda row: -len(row[1])):
+    rows = [(limits, [limit for limit in limits if not limit.met]) for limits in judged if limits]
+    for limits, broken in sorted(rows, key=lambda row: -len(row[1])):
         first = broken[0].text if broken else ""
-        table.add(own[0].recording, len(own), len(broken), first)
+        table.add(limits[0].recording, len(limits), len(broken), first)
     return table
 
 
 def broken_table(broken: "Sequence[Judged]") -> ResultTable:
-    """Limits of a budget that are broken, and why."""
+    """Make a table of the limits of a budget that are broken, and why."""
     columns = [*words("recording", "where", "limit"), *figures("budget", "found")]
     table = ResultTable("Limits that are broken", [*columns, *words("because")])
-    for one in broken:
-        shown = percent if one.what == "missing" else ms
-        values = shown(one.limit), shown(one.found)
-        table.add(one.recording, one.where, one.what, *values, one.because or "")
+    for judged in broken:
+        shown = percent if judged.what == "missing" else ms
+        values = shown(judged.limit), shown(judged.found)
+        table.add(judged.recording, judged.where, judged.what, *values, judged.because or "")
     return table
 
 
 def changes_table(changes: Iterable[WantedScheduling]) -> ResultTable:
-    """What a plan would give to each thread, a row each."""
+    """Make a table of the scheduling that a plan would give to each thread."""
     names = ("node", "pid", "tid", "name", "role", "server", "class", "core", "why")
     table = ResultTable("What threads would get", words(*names))
-    for one in changes:
-        thread, wanted = one.node_thread.thread, one.scheduling
+    for change in changes:
+        thread, wanted = change.node_thread.thread, change.scheduling
         scheduling = "as it is"
         if wanted.priority is not None:
             scheduling = scheduling_text(POLICIES[wanted.policy], wanted.priority)
         cores = listed(wanted.cores) if wanted.cores else "as they are"
-        about = ", ".join(one.node_thread.nodes), thread.pid, thread.tid, thread.comm, thread.role
-        table.add(*about, one.server or "", scheduling, cores, one.reason)
+        table.add(
+            ", ".join(change.node_thread.nodes),
+            thread.pid,
+            thread.tid,
+            thread.comm,
+            thread.role,
+            change.server or "",
+            scheduling,
+            cores,
+            change.reason,
+        )
     return table
 
 
 def sweep_table(frame: pl.DataFrame) -> ResultTable:
-    """The axes and the most important figures of each point, those of many only for the first."""
+    """Make a table of a sweep: the axes and most important figures of the first points."""
     axes = sweep_axes(frame)
     names = [name.removesuffix("_ns") for name in (*axes, *SWEEP_FIGURES.values())]
     table = ResultTable("Simulated end-to-end latency [ms]", figures(*names))
     for row in frame.head(MOST_ROWS).to_dicts():
         row["kept"] = PROMISE[row["kept"]]
-        found = [ms(row[n]) if n.endswith("_ns") else row[n] for n in SWEEP_FIGURES]
+        cells = [
+            ms(row[figure]) if figure.endswith("_ns") else row[figure] for figure in SWEEP_FIGURES
+        ]
         if row["error"] is not None:
-            found = ["failed", *([""] * (len(found) - 1))]
-        table.add(*(sweep_value(name, row[name]) for name in axes), *found)
+            cells = ["failed", *([""] * (len(cells) - 1))]
+        table.add(*(sweep_value(name, row[name]) for name in axes), *cells)
     if frame.height > MOST_ROWS:
         table.caption = f"the first {MOST_ROWS} of {frame.height} points"
     return table
 
 
 def sweep_axes(frame: pl.DataFrame) -> list[str]:
-    """Axes stand before what all sweeps have; a seed that is varied is one of them."""
+    """Names of a sweep's axes: the columns before those that all sweeps have.
+
+    A seed that is varied is an axis.
+    """
     return frame.columns[: frame.columns.index("cycles")]
 
 
 def sweep_value(name: str, value: Any) -> str:
-    """A point's place on an axis."""
+    """Text of a point's place on an axis."""
     if value is None:
         return ABSENT
     return format_duration(value) if name.endswith("_ns") else str(value)

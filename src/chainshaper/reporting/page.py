@@ -1,15 +1,14 @@
 """The report: one HTML page with everything in it that a timing engineer sends to a colleague.
 
-It loads nothing: it works from a disk, in an archive, and without a network. Tables are written
-here; charts are drawn in the page by its script, from data that it carries: small enough for a
-page, exact where it counts. Of many cycles, the chart over time has of every stretch the shortest
-and the longest, so that no extreme is lost, and of the others every n-th, so that their density is
-not distorted; the histogram counts all cycles in bins so fine that they are joined for every
-drawing.
+The page loads nothing: it works from a disk, in an archive, and without a network. Tables are
+written here. The page's script draws the charts, from data in the page. If a recording has many
+cycles, the chart over time shows a selection: of each stretch the shortest and the longest, so that
+no extreme is lost, and of the others every n-th, so that their density is right. The histogram
+counts all cycles in fine bins, which the script joins for each drawing.
 
-Nothing that a recording says is trusted. Text is escaped where tables are written; data stands in
-a block that browsers do not execute, with every character escaped that could end it; and the page
-forbids itself, by its content security policy, to run any script but its own and to load anything.
+No text from a recording is trusted. Tables escape it. Data stands in a block that browsers do not
+execute, and every character that could end that block is escaped. The page's content security
+policy forbids to run any script but the page's own, and to load anything.
 """
 
 import base64
@@ -40,10 +39,10 @@ from chainshaper.verify.overruns import moves_in, moves_text, next_cycles, overr
 
 ENDINGS = (".html", ".htm")
 LISTED = 50
-"""Rows of a list that may be endless."""
+"""Rows of a list that are shown at most."""
 
 POINTS = 4_000
-"""Points of the chart over time, per recording."""
+"""Points of the chart over time, per recording, at most."""
 
 BINS = 10_000
 """Fine bins over a recording's latencies at most."""
@@ -53,7 +52,7 @@ WAITING = '<p class="waiting">This chart is drawn by a script: allow scripts to 
 
 @dataclass(frozen=True)
 class _NamedMeasurement:
-    """A measurement under the ``name`` that tells it from the report's others."""
+    """A measurement with the ``name`` of its recording in this report."""
 
     name: str
     measurement: Measurement
@@ -66,10 +65,11 @@ def write_report(
     path: str | Path,
     cycles: Sequence[int] = (),
 ) -> Path:
-    """Write the report of one chain in one or several recordings, whole or not at all.
+    """Write the report of chains in recordings as an HTML file, whole or not at all.
 
-    Of several chains of an application, give a comparison each, of the same recordings. ``cycles``
-    are numbers of cycles that the timeline has to show, should it not have room for all.
+    ``measurements`` are of one chain, in one or several recordings; or they are comparisons of
+    several chains, each in the same recordings. ``cycles`` are numbers of cycles that the timeline
+    shows at any rate, even if it has no room for all.
 
     Raises InputError: the path exists already or is no HTML file, or there is no such cycle.
     OperationError: it cannot be written; nothing is left behind.
@@ -81,23 +81,26 @@ def write_report(
 def report_page(
     measurements: Sequence[Measurement] | Sequence[Comparison], cycles: Sequence[int] = ()
 ) -> str:
-    """The report as the text of an HTML file."""
+    """Make the report as the text of an HTML file."""
     if not measurements:
         raise InputError("a report needs a recording at least")
-    chains = [one for one in measurements if isinstance(one, Comparison)]
-    if own := tuple(one for one in measurements if isinstance(one, Measurement)):
-        chains = [Comparison(own[0].analysis.chain.spec, own)]
-    every = [one for chain in chains for one in chain.measurements]
-    most = max(measurement.analysis.traversals.height for measurement in every)
+    chains = [given for given in measurements if isinstance(given, Comparison)]
+    if of_single_chain := tuple(given for given in measurements if isinstance(given, Measurement)):
+        chains = [Comparison(of_single_chain[0].analysis.chain.spec, of_single_chain)]
+    all_measurements = [measurement for chain in chains for measurement in chain.measurements]
+    most = max(measurement.analysis.traversals.height for measurement in all_measurements)
     for cycle in cycles:
         if not 0 <= cycle < most:
             raise InputError(
                 f"there is no cycle {cycle}: the recordings have {most} at most, numbered from 0"
             )
     shared, several = chains[0].measurements, len(chains) > 1
-    names = distinct_names([one.recording.path for one in shared])
-    recorded = {id(one.recording): one.recording for one in every}  # once, whatever its chains
-    flows = {key: recorded_flow(one) for key, one in recorded.items()}
+    names = distinct_names([measurement.recording.path for measurement in shared])
+    # A recording is resolved once, however many chains it has.
+    recorded = {
+        id(measurement.recording): measurement.recording for measurement in all_measurements
+    }
+    flows = {key: recorded_flow(recording) for key, recording in recorded.items()}
     page, of_each, style, script = (
         (resources.files("chainshaper.reporting") / name).read_text("utf-8")
         for name in ("page.html", "chain.html", "page.css", "page.js")
@@ -105,10 +108,12 @@ def report_page(
     blocks, drawn = [], []
     for number, chain in enumerate(chains):
         parts = []
-        for name, one in zip(names, chain.measurements, strict=True):
-            flow = flows[id(one.recording)]
-            timeline = timeline_of(one.recording, flow, one.analysis, one.plan)
-            parts.append(_NamedMeasurement(name, one, flow, timeline))
+        for name, measurement in zip(names, chain.measurements, strict=True):
+            flow = flows[id(measurement.recording)]
+            timeline = timeline_of(
+                measurement.recording, flow, measurement.analysis, measurement.plan
+            )
+            parts.append(_NamedMeasurement(name, measurement, flow, timeline))
         data = _drawn(parts, cycles, number)
         places = _tables(parts, data["n"], several) | _beside_charts(parts, data["recordings"])
         blocks.append(Template(of_each).substitute(places, n=data["n"]))
@@ -119,7 +124,9 @@ def report_page(
     headline = _paragraph(of_chain.headline(names, shared), "verdict")
     if several:
         headline = of_chain.overview_table(chains, names).html()
-    left_out = [(name, one.left_out.text) for name, one in zip(names, shared, strict=True)]
+    left_out = [
+        (name, measurement.left_out.text) for name, measurement in zip(names, shared, strict=True)
+    ]
     return Template(page).substitute(
         title=escape(f"End-to-end latency of {about}"),
         headline=headline + "".join(_paragraph(f"{n}: {t}.") for n, t in left_out if t),
@@ -134,7 +141,7 @@ def report_page(
 
 
 def _plans_of(parts: Sequence[_NamedMeasurement]) -> dict[str, ChainPlan]:
-    """The plans that were in force, by the names of their recordings; equal ones stand once."""
+    """Map names of recordings to the plan that was in force in them; equal plans stand once."""
     plans: dict[str, tuple[list[str], ChainPlan]] = {}
     for part in parts:
         if (plan := part.measurement.plan) is not None:
@@ -145,17 +152,19 @@ def _plans_of(parts: Sequence[_NamedMeasurement]) -> dict[str, ChainPlan]:
 def _drawn(
     parts: Sequence[_NamedMeasurement], cycles: Sequence[int], number: int
 ) -> dict[str, Any]:
-    """Everything that is drawn of a chain; ``n`` is what ids end in, nothing for the first."""
+    """Collect the data of a chain's charts; ``n`` is the end of their ids, "" for the first."""
     suffix = f"-{number + 1}" if number else ""
     recordings = [_recording_data(part, cycles) for part in parts]
-    points = [one["points"] for one in recordings]
-    times = [time for one in points for time in (*one["time"][-1:], *one["incomplete"][-1:])]
+    points = [recording["points"] for recording in recordings]
+    times = [time for drawn in points for time in (*drawn["time"][-1:], *drawn["incomplete"][-1:])]
     slots = enumerate(_plans_of(parts).values())
     bars = {f"slots-{place}{suffix}": _slot_bars(plan) for place, plan in slots}
     return {
         "n": suffix,
         "recordings": recordings,
-        "publishSlots": list(dict.fromkeys(slot for one in recordings for slot in one["slots"])),
+        "publishSlots": list(
+            dict.fromkeys(slot for recording in recordings for slot in recording["slots"])
+        ),
         "longest": max([1, *times]),
         "range": latency_range(recordings),
         "bars": {f"breakdown{suffix}": _hop_bars(parts), **bars},
@@ -163,16 +172,16 @@ def _drawn(
 
 
 def _safe(value: Any) -> Any:
-    """Plain data with all its texts as they are shown."""
+    """Plain data with control characters of all its texts made visible."""
     if isinstance(value, str):
         return shown(value)
     if isinstance(value, dict):
-        return {key: _safe(one) for key, one in value.items()}
-    return [_safe(one) for one in value] if isinstance(value, list | tuple) else value
+        return {key: _safe(item) for key, item in value.items()}
+    return [_safe(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def distinct_names(paths: Sequence[Path]) -> list[str]:
-    """The last parts of each path, as many as it takes to tell them apart."""
+    """Names of paths: their last parts, as few as set them apart."""
     parts = [path.absolute().parts for path in paths]
     for length in range(1, max(map(len, parts), default=0) + 1):
         names = ["/".join(part[-length:]) for part in parts]
@@ -182,21 +191,26 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
 
 
 def _tables(parts: Sequence[_NamedMeasurement], suffix: str, several: bool) -> dict[str, str]:
-    """What a chain's tables say, by the places that the template has for them. Of ``several``
-    chains each has a heading, and the first has the callbacks of all."""
-    names = [one.name for one in parts]
-    measurements = [one.measurement for one in parts]
+    """Make the HTML of a chain's tables, by the placeholders of the template.
+
+    If there are ``several`` chains, each has a heading, and the first has the callbacks of all.
+    """
+    names = [part.name for part in parts]
+    measurements = [part.measurement for part in parts]
     compared = Comparison(measurements[0].analysis.chain.spec, tuple(measurements))
     incomplete = of_chain.incomplete_table(names, measurements)
     verdict = _paragraph(of_chain.headline(names, measurements), "verdict")
     callbacks = "\n".join(map(_callbacks, parts))
     hops = (
-        _paragraph(f"{one.name}, all complete cycles [ms]:")
-        + of_chain.breakdown_table(one.measurement.analysis).html()
-        for one in parts
+        _paragraph(f"{part.name}, all complete cycles [ms]:")
+        + of_chain.breakdown_table(part.measurement.analysis).html()
+        for part in parts
     )
-    plans = (_plan(f"{n}{suffix}", *one) for n, one in enumerate(_plans_of(parts).items()))
-    every = "Every cycle that began is complete."
+    plans = (
+        _plan(f"{number}{suffix}", users, plan)
+        for number, (users, plan) in enumerate(_plans_of(parts).items())
+    )
+    none_incomplete = "Every cycle that began is complete."
     section = f'<section id="callbacks">\n<h2>Callbacks</h2>\n{callbacks}\n</section>'
     return {
         "heading": f"<h1>{escape(compared.chain)}</h1>\n{verdict}" if several else "",
@@ -206,19 +220,21 @@ def _tables(parts: Sequence[_NamedMeasurement], suffix: str, several: bool) -> d
         "predictions": "\n".join(map(_prediction, parts)),
         "hops": "\n".join(hops),
         "overruns": "\n".join(_overruns(part) + _moves(part) for part in parts),
-        "incomplete": incomplete.html() if incomplete.rows else _paragraph(every),
+        "incomplete": incomplete.html() if incomplete.rows else _paragraph(none_incomplete),
         "stalls": "\n".join(map(_stalls, parts)),
         "plans": "\n".join(plans),
     }
 
 
 def _conditions(names: Sequence[str], chains: Sequence[Comparison]) -> str:
-    """How each recording was taken, and what is to be known about it and its chains."""
+    """Make the HTML on how each recording was taken, with its threads and notes."""
     recordings = [*zip(*(chain.measurements for chain in chains), strict=True)]
     parts, items = [overviews.condition_table(names, recordings).html()], ""
-    for name, own in zip(names, recordings, strict=True):
-        parts.append(_recorded_threads(name, own[0]))
-        for note in dict.fromkeys(note for one in own for note in one.analysis.notes):
+    for name, of_recording in zip(names, recordings, strict=True):
+        parts.append(_recorded_threads(name, of_recording[0]))
+        for note in dict.fromkeys(
+            note for measurement in of_recording for note in measurement.analysis.notes
+        ):
             items += f"<li>{escape(f'{name}: {note}')}</li>"
     return "\n".join([*parts, f'<ul class="notes">{items}</ul>'])
 
@@ -226,14 +242,14 @@ def _conditions(names: Sequence[str], chains: Sequence[Comparison]) -> str:
 def _beside_charts(
     parts: Sequence[_NamedMeasurement], data: Sequence[dict[str, Any]]
 ) -> dict[str, str]:
-    """Legends, choices, and what charts leave out."""
-    every, sample, points, cycles = [], [], "", ""
-    for part, one in zip(parts, data, strict=True):
-        total, drawn = one["points"]["of"], len(one["points"]["cycle"])
-        number, here = one["timeline"]["of"], len(one["timeline"]["cycles"])
+    """Make the HTML beside charts: legends, choices, and notes on what charts leave out."""
+    all_cycles, sample, points, cycles = [], [], "", ""
+    for part, of_part in zip(parts, data, strict=True):
+        total, drawn = of_part["points"]["of"], len(of_part["points"]["cycle"])
+        number, here = of_part["timeline"]["of"], len(of_part["timeline"]["cycles"])
         kind = "complete" if part.measurement.longest_stall_ns is None else "undisturbed"
-        every.append(f"{part.name} ({total} cycles)")
-        sample.append(f"{part.name} ({one['histogram']['total']} {kind} cycles)")
+        all_cycles.append(f"{part.name} ({total} cycles)")
+        sample.append(f"{part.name} ({of_part['histogram']['total']} {kind} cycles)")
         if drawn < total:
             points += (
                 f" Of {total} cycles of {part.name} {drawn} are drawn: of every stretch the"
@@ -245,7 +261,7 @@ def _beside_charts(
                 " incomplete ones, those asked for, and a sample of the others."
             )
     return {
-        "legend": _legend(every),
+        "legend": _legend(all_cycles),
         "legend_of_sample": _legend(sample),
         "fewer_points": escape(points),
         "fewer_cycles": escape(cycles),
@@ -263,7 +279,7 @@ def _legend(names: Sequence[str]) -> str:
 
 
 def _prediction(part: _NamedMeasurement) -> str:
-    """Predicted beside measured, where a plan was in force."""
+    """Make the HTML of predicted beside measured figures, if a plan was in force."""
     judged = part.measurement.prediction
     if judged is None:
         return ""
@@ -281,7 +297,7 @@ def _callbacks(part: _NamedMeasurement) -> str:
 
 
 def _moves(part: _NamedMeasurement) -> str:
-    """Slots that followed the latencies, move by move."""
+    """Make the HTML of the moves of slots that followed the latencies."""
     moves = moves_in(part.measurement.analysis)
     if not moves:
         return ""
@@ -294,7 +310,7 @@ def _moves(part: _NamedMeasurement) -> str:
 
 
 def _overruns(part: _NamedMeasurement) -> str:
-    """Outputs that came behind their slot, one by one."""
+    """Make the HTML of the outputs that came behind their slot."""
     measurement = part.measurement
     if measurement.overruns is None:
         return _paragraph(f"{part.name}: nothing was gated, so nothing could overrun.")
@@ -303,8 +319,8 @@ def _overruns(part: _NamedMeasurement) -> str:
     about = _paragraph(f"{part.name}: {overruns_text(measurement.overruns)}.")
     columns = [*words("policy"), *figures("late", "discarded", "next cycle hit")]
     outcomes = ResultTable("", columns)
-    for policy, one in measurement.outcomes.items():
-        outcomes.add(policy, one.late, one.discarded, next_cycles({policy: one}))
+    for policy, outcome in measurement.outcomes.items():
+        outcomes.add(policy, outcome.late, outcome.discarded, next_cycles({policy: outcome}))
     about += outcomes.html() if outcomes.rows else ""
     latencies = measurement.analysis.traversals.select("traversal", "latency_ns")
     late = part.timeline.holds.filter(pl.col("overrun").is_not_null()).join(
@@ -365,7 +381,7 @@ def _details(summary: str, content: str, *, unfolded: bool = False) -> str:
 
 
 def _recording_data(part: _NamedMeasurement, cycles: Sequence[int]) -> dict[str, Any]:
-    """Everything that is drawn of one recording; its timeline has ``cycles`` in any case."""
+    """Collect the data of a recording's charts; its timeline has ``cycles`` at any rate."""
     measurement, plan = part.measurement, part.measurement.plan
     traversals = measurement.analysis.traversals
     zero = next(iter(traversals["start"]), 0)
@@ -379,9 +395,12 @@ def _recording_data(part: _NamedMeasurement, cycles: Sequence[int]) -> dict[str,
 
 
 def latency_range(recordings: Sequence[dict[str, Any]]) -> tuple[float, float]:
-    """The range of undisturbed latencies and slots, with a little air."""
-    ends = [end for one in recordings for slot in one["slots"] for end in slot]
-    for histogram in (one["histogram"] for one in recordings if one["histogram"]["bin"]):
+    """The range (ns) of undisturbed latencies and slots, with a little air."""
+    ends = [end for recording in recordings for slot in recording["slots"] for end in slot]
+    for recording in recordings:
+        histogram = recording["histogram"]
+        if not histogram["bin"]:
+            continue
         first, last = histogram["bin"][0], histogram["bin"][-1]
         ends += [first * histogram["width"], (last + 1) * histogram["width"]]
     if not ends:
@@ -395,42 +414,48 @@ _OPACITY = {"communication": 0.35, "waiting": 0.15}
 
 
 def _hop_bars(parts: Sequence[_NamedMeasurement]) -> dict[str, Any]:
-    """Mean communication (pale), computation (full) and waiting (palest) of every hop, a row per
-    recording."""
+    """Collect the bars of mean communication, computation and waiting of each hop.
+
+    A row per recording. Communication is pale, computation full, waiting palest.
+    """
     rows, longest = [], 1.0
-    for series, one in enumerate(parts):
+    for series, recording in enumerate(parts):
         bars, at = [], 0.0
-        breakdown = hop_breakdown(one.measurement.analysis)
+        breakdown = hop_breakdown(recording.measurement.analysis)
         for number, hop in enumerate(breakdown.iter_rows(named=True)):
-            for part in PARTS:
-                mean, share = (hop[f"{part}_ns"] or {}).get("mean"), hop[f"{part}_share"]
+            for share_of in PARTS:
+                mean, share = (hop[f"{share_of}_ns"] or {}).get("mean"), hop[f"{share_of}_share"]
                 if not mean:
                     continue
-                opacity = _OPACITY.get(part, 0.8 if number % 2 else 1)
-                text = f"{hop['callback']} → {hop['topic']}\n{part} {ms(mean)} ms, {share:.1%}"
+                opacity = _OPACITY.get(share_of, 0.8 if number % 2 else 1)
+                text = f"{hop['callback']} → {hop['topic']}\n{share_of} {ms(mean)} ms, {share:.1%}"
                 bars.append((at, at + mean, f"series-{series % 4}", opacity, text))
                 at += mean
-        rows.append((one.name, bars))
+        rows.append((recording.name, bars))
         longest = max(longest, at)
     label = "mean, from the start of the cycle"
     return {"label": label, "length": longest * 1.01, "rows": rows}
 
 
 def _slot_bars(plan: ChainPlan) -> dict[str, Any]:
-    """The servers' slots over one cycle, a row per server."""
+    """Collect the bars of the servers' slots over one cycle, a row per server."""
     rows = []
-    for one in plan.servers:
-        look = "series-1" if one.slots == publish_slots(plan) else "slot"
-        bars = [(*slot, look, 1, f"{one.name}\n{slots_ms(slot)} ms") for slot in one.slots]
-        rows.append((f"{one.name}: core {one.core}, priority {one.priority}", bars))
+    for server in plan.servers:
+        look = "series-1" if server.slots == publish_slots(plan) else "slot"
+        bars = [(*slot, look, 1, f"{server.name}\n{slots_ms(slot)} ms") for slot in server.slots]
+        rows.append((f"{server.name}: core {server.core}, priority {server.priority}", bars))
     return {"label": "in the cycle", "length": plan.cycle_ns, "zoom": "x", "rows": rows}
 
 
 def latency_points(traversals: pl.DataFrame, zero: int, limit: int = POINTS) -> dict[str, Any]:
-    """Latency over time: ``cycle, time, latency`` of those that are drawn, in order of time.
+    """Select at most ``limit`` cycles for the chart of latency over time.
 
-    ``disturbed`` are their places in these lists. ``of`` says how many complete cycles there are,
-    ``incomplete`` when the others began.
+    * ``of``: how many complete cycles there are.
+    * ``cycle``, ``time``, ``latency``: lists of number, start and latency (ns) of those drawn.
+    * ``disturbed``: the places in these lists of the disturbed cycles.
+    * ``incomplete``: when incomplete cycles began (ns).
+
+    Times count from ``zero``.
     """
     drawn = complete = traversals.filter("complete")
     if complete.height > limit:
@@ -455,10 +480,12 @@ def latency_points(traversals: pl.DataFrame, zero: int, limit: int = POINTS) -> 
 
 
 def latency_histogram(traversals: pl.DataFrame, bins: int = BINS) -> dict[str, Any]:
-    """Undisturbed latencies counted in bins [n·width, (n+1)·width) of a width that is 10^k ns.
+    """Count undisturbed latencies in bins [n·width, (n+1)·width) of a width that is 10^k ns.
 
-    ``bin`` are the numbers n of those that are not empty, ``count`` how many are in them, ``total``
-    how many there are.
+    * ``width``: of a bin (ns).
+    * ``bin``: the numbers n of bins that are not empty.
+    * ``count``: of the latencies in each of these.
+    * ``total``: of all latencies.
     """
     calm = traversals.filter(pl.col("complete") & ~pl.col("disturbed"))
     latencies, width = calm["latency_ns"].to_numpy(), 1

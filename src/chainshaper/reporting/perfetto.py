@@ -1,13 +1,14 @@
 """A recording as a trace that ui.perfetto.dev opens, or as MCAP, which Foxglove plots.
 
-What is in the former: the threads of every process with their callbacks; each publication as an
-instant, with an arrow to the callback that took the message; what asynchronous publishers'
-threads sent; and, as rows of their own, the traversals of the chain with their hops, what the gate
-retained, the slots of the servers, and stalls of the machine. Times are ns of the event clock.
+Perfetto's trace has the threads of every process with their callbacks; each publication as an
+instant, with an arrow to the callback that took the message; and the sends of asynchronous
+publishers' threads. Further rows have the traversals of the chain with their hops, the messages
+that the gate held back, the slots of the servers, and stalls of the machine. Times are ns of the
+event clock.
 
 A trace is a sequence of packets in protobuf's encoding; each packet describes a track, or an event
-of one. Slices of one track must nest: a track whose slices overlap otherwise is written as
-several of one name, which the viewer shows as one. Numbers of fields and enumerations are those of
+of a track. Slices of one track must nest. A track whose slices overlap partly is written as several
+tracks of one name, which the viewer shows as one. Numbers of fields and enumerations are those of
 `protos/perfetto/trace/` (perfetto.dev, "Advanced Guide to Programmatic Trace Generation").
 """
 
@@ -35,10 +36,10 @@ from chainshaper.verify.measure import PARTS, Measurement
 ENDINGS = (".pftrace", ".perfetto-trace")
 
 BEGIN, END, INSTANT = 1, 2, 3  # TrackEvent.Type
-REALTIME, TRACE_TIME = 1, 6  # BuiltinClock; time stamps without a clock's number are of the second
+REALTIME, TRACE_TIME = 1, 6  # BuiltinClock; time stamps without a clock's number are TRACE_TIME
 EXPLICIT = 3  # TrackDescriptor.ChildTracksOrdering: by rank
 VARINT, FIXED64, LENGTH = 0, 1, 2  # protobuf's wire types
-SEQUENCE = 1  # one writer wrote all of it
+SEQUENCE = 1  # number of the only writer
 
 Value: TypeAlias = str | int | bool | None
 Thread: TypeAlias = tuple[int, int]
@@ -46,41 +47,33 @@ Thread: TypeAlias = tuple[int, int]
 
 @dataclass(frozen=True)
 class Slice:
-    """What lasted from ``start`` to ``end`` (ns), or happened at ``start`` (``end`` None).
+    """A span of a track, or an instant."""
 
-    ``flows`` are the numbers of arrows that begin here, ``ends_flows`` of those that end here.
-    Arguments that are None are not written.
-    """
-
-    start: int
-    end: int | None
+    start: int  # ns
+    end: int | None  # ns; None: it is an instant
     name: str
-    arguments: Mapping[str, Value] = field(default_factory=dict)
-    flows: Sequence[int] = ()
-    ends_flows: Sequence[int] = ()
+    arguments: Mapping[str, Value] = field(default_factory=dict)  # None is not written
+    flows: Sequence[int] = ()  # numbers of the arrows that begin here
+    ends_flows: Sequence[int] = ()  # numbers of the arrows that end here
 
     @property
     def last(self) -> int:
-        """When it is over."""
+        """Its last instant (ns)."""
         return self.start if self.end is None else self.end
 
 
 @dataclass(frozen=True)
 class Track:
-    """One row: a thread (pid, tid) of a process, or a row of a named group beside them.
+    """A row of the viewer: a thread of a process, or a row of another group."""
 
-    ``owner`` is the process's or the group's name. ``slices`` are families: a slice and those
-    that lie within it, which stay together.
-    """
-
-    owner: str
+    owner: str  # name of the process or group
     name: str
-    families: Sequence[Sequence[Slice]]
-    thread: Thread | None = None
+    families: Sequence[Sequence[Slice]]  # each a slice and those that lie within it
+    thread: Thread | None = None  # its pid and tid
 
 
 def export_perfetto(source: Recording | Measurement, path: str | Path) -> Path:
-    """Write a recording for Perfetto; a measurement adds its chain, and the plan in force.
+    """Write a recording for Perfetto; a measurement also has its chain, and the plan in force.
 
     Raises InputError: the path exists already, or ends in none of :data:`ENDINGS`. OperationError:
     it cannot be written; nothing is left behind.
@@ -111,9 +104,9 @@ def export_perfetto(source: Recording | Measurement, path: str | Path) -> Path:
 def export_mcap(source: Recording | Measurement, path: str | Path) -> Path:
     """Write times of callbacks, and of a measurement's chain, as messages for Foxglove.
 
-    A topic for each node, ``/chainshaper/<node>``, has its callback instances as they end, and
-    ``/chainshaper/latency`` the chain's cycles; times are ms, log times CLOCK_REALTIME, as those of
-    a bag of the same run. Messages are JSON, with a schema.
+    A topic for each node, ``/chainshaper/<node>``, has a message for each callback instance, at its
+    end; the topic ``/chainshaper/latency`` has one for each cycle of the chain. Times are in ms,
+    log times are CLOCK_REALTIME, as in a bag of the same run. Messages are JSON, with a schema.
 
     Raises InputError: the path exists already, or does not end in `.mcap`. PlatformError: the
     package mcap is not installed. OperationError: it cannot be written; nothing is left behind.
@@ -122,15 +115,15 @@ def export_mcap(source: Recording | Measurement, path: str | Path) -> Path:
     writing = extra_library("mcap.writer", "writing MCAP", "mcap")
     recording = source.recording if isinstance(source, Measurement) else source
     flow = recorded_flow(recording)
-    about = {one.id: one for one in graph_of(flow).callbacks}
+    callbacks = {callback.id: callback for callback in graph_of(flow).callbacks}
     rows: list[tuple[int, int, str, dict[str, Value | float]]] = []
     took = flow.instances.drop_nulls("end").select("callback_id", "start", "end", "execution_ns")
     for number, start, end, used in took.iter_rows():
-        one = about[number]
-        starts = trigger_text(one.topic, one.period_ns, one.declared_ns)
+        callback = callbacks[number]
+        starts = trigger_text(callback.topic, callback.period_ns, callback.declared_ns)
         values: dict[str, Value | float] = {"callback": starts}
         values |= {"response_ms": (end - start) / 1e6, "execution_ms": used and used / 1e6}
-        rows.append((end, start, one.node or "/unknown", values))
+        rows.append((end, start, callback.node or "/unknown", values))
     if isinstance(source, Measurement):
         cycles = source.analysis.traversals.select("start", "end", "latency_ns", "late", "reason")
         for start, end, latency, late, reason in cycles.iter_rows():
@@ -145,7 +138,7 @@ def export_mcap(source: Recording | Measurement, path: str | Path) -> Path:
     for end, start, topic, values in sorted(rows, key=lambda row: row[0]):
         if topic not in channels:
             channels[topic] = writer.register_channel(f"/chainshaper{topic}", "json", number)
-        data = json.dumps({name: one for name, one in values.items() if one is not None})
+        data = json.dumps({name: value for name, value in values.items() if value is not None})
         writer.add_message(channels[topic], end + offset, data.encode(), start + offset)
     writer.finish()
     return write_whole(path, [file.getvalue()])
@@ -159,9 +152,10 @@ _JSON_TYPES = {
 
 
 def _thread_tracks(recording: Recording, flow: DataFlow, timeline: Timeline) -> list[Track]:
+    """Make a track for each thread, the chain's nodes first."""
     rows = defaultdict[Thread, list[list[Slice]]](list)
-    for thread, one in chain(_callbacks(flow, timeline), _messages(flow)):
-        rows[thread].append([one])
+    for thread, event in chain(_callbacks(flow, timeline), _messages(flow)):
+        rows[thread].append([event])
     known = timeline.threads.select("pid", "tid", "nodes", "about").iter_rows()
     nodes = {(pid, tid): (names, about) for pid, tid, names, about in known}
     comms = {(thread.pid, thread.tid): thread.comm for thread in recording.info.threads}
@@ -175,25 +169,29 @@ def _thread_tracks(recording: Recording, flow: DataFlow, timeline: Timeline) -> 
 
 
 def _arrows(flow: DataFlow, end: str) -> dict[int, list[int]]:
-    """The numbers of the arrows at each ``publication``, or at each ``instance`` that reads."""
+    """Map each ``publication``, or ``instance`` that reads (``end``), to numbers of its arrows."""
     taken = flow.takes.drop_nulls(["publication", end]).group_by(end).agg(pl.col("take") + 1)
     return dict(taken.iter_rows())
 
 
 def _callbacks(flow: DataFlow, timeline: Timeline) -> Iterator[tuple[Thread, Slice]]:
+    """Yield a slice for each callback instance, with its thread."""
     callbacks = {callback.id: callback for callback in graph_of(flow).callbacks}
     arrows = _arrows(flow, "instance")
     columns = ("pid", "tid", "callback_id", "instance", "start", "end", "ended", "execution_ns")
     rows = timeline.slices.select(columns).iter_rows()
     for pid, tid, number, instance, start, end, ended, used in rows:
-        one, arrived = callbacks[number], arrows.get(instance, ())
-        arguments = {"function": one.symbol, "instance": instance, "execution_ns": used}
+        callback, arrived = callbacks[number], arrows.get(instance, ())
+        arguments = {"function": callback.symbol, "instance": instance, "execution_ns": used}
         arguments["end"] = None if ended else "not recorded"
-        yield (pid, tid), Slice(start, end, one.label, arguments, ends_flows=arrived)
+        yield (pid, tid), Slice(start, end, callback.label, arguments, ends_flows=arrived)
 
 
 def _messages(flow: DataFlow) -> Iterator[tuple[Thread, Slice]]:
-    """Publications; takes whose message no callback got: its arrow ends at the take; and sends."""
+    """Yield slices, with their threads, for publications, takes and sends.
+
+    Only takes whose message no callback got: there the arrow ends at the take.
+    """
     arrows = _arrows(flow, "publication")
     columns = ("pid", "tid", "time", "topic", "publication", "source_timestamp")
     for pid, tid, time, topic, number, stamp in flow.publications.select(columns).iter_rows():
@@ -209,8 +207,7 @@ def _messages(flow: DataFlow) -> Iterator[tuple[Thread, Slice]]:
 
 
 def _chain_track(analysis: LatencyAnalysis) -> Track:
-    """Traversals, each with its hops inside, from start to publication; incomplete ones as
-    instants."""
+    """Make the track of traversals, with their hops inside; incomplete ones are instants."""
     path, hops = analysis.graph.path(analysis.chain), defaultdict[int, list[Slice]](list)
     for row in analysis.hops.drop_nulls("publish").sort("traversal", "hop").iter_rows(named=True):
         name = f"{path[row['hop']].node} → {row['topic']}"
@@ -229,7 +226,7 @@ def _chain_track(analysis: LatencyAnalysis) -> Track:
 
 
 def _gate_tracks(analysis: LatencyAnalysis, timeline: Timeline) -> Iterator[Track]:
-    """What the shaping nodes retained, from arrival until they let it go (or gave it up)."""
+    """Yield a track for each shaping node: its messages from their arrival until it let them go."""
     path = analysis.graph.path(analysis.chain)
     for (hop,), rows in timeline.holds.group_by("hop", maintain_order=True):
         families = []
@@ -243,8 +240,11 @@ def _gate_tracks(analysis: LatencyAnalysis, timeline: Timeline) -> Iterator[Trac
 
 
 def encode_trace(tracks: Sequence[Track], clock_offset_ns: int) -> Iterator[bytes]:
-    """The file, packet by packet. ``clock_offset_ns`` leads to CLOCK_REALTIME."""
-    first = min((one.start for track in tracks for f in track.families for one in f), default=0)
+    """Yield the packets of the file; ``clock_offset_ns`` is CLOCK_REALTIME less the event clock."""
+    first = min(
+        (event.start for track in tracks for family in track.families for event in family),
+        default=0,
+    )
     readings = ((TRACE_TIME, first), (REALTIME, first + clock_offset_ns))
     clocks = (_message(1, _integer(1, clock) + _integer(2, time)) for clock, time in readings)
     yield _packet(_message(6, b"".join(clocks)))
@@ -271,14 +271,19 @@ def encode_trace(tracks: Sequence[Track], clock_offset_ns: int) -> Iterator[byte
 
 
 def _lanes(families: Sequence[Sequence[Slice]]) -> list[list[Slice]]:
-    """Families over as few lanes as they need so that those of a lane do not overlap partly."""
-    lanes: list[tuple[list[Slice], list[int]]] = []  # and the ends of what is open, outermost first
+    """Distribute families over as few lanes as possible, so that none in a lane overlap partly."""
+    # Each lane with the ends of its open slices, outermost first.
+    lanes: list[tuple[list[Slice], list[int]]] = []
     for family in sorted(families, key=lambda f: (f[0].start, -f[0].last)):
         start, end = family[0].start, family[0].last
         for _, ends in lanes:
             while ends and ends[-1] <= start:
                 ends.pop()
-        fitting = (one for one in lanes if not one[1] or (end <= one[1][-1] and len(family) == 1))
+        fitting = (
+            candidate
+            for candidate in lanes
+            if not candidate[1] or (end <= candidate[1][-1] and len(family) == 1)
+        )
         if (lane := next(fitting, None)) is None:
             lanes.append(lane := ([], []))
         lane[0].extend(family)
@@ -287,25 +292,26 @@ def _lanes(families: Sequence[Sequence[Slice]]) -> list[list[Slice]]:
 
 
 def _events(uuid: int, lane: list[Slice]) -> Iterator[bytes]:
-    """The events of one track in order of time: what begins last ends first."""
+    """Yield the events of a track in order of time: the slice that begins last ends first."""
     open_until: list[int] = []
     end = _message(11, _integer(9, END) + _integer(11, uuid))
-    for one in sorted(lane, key=lambda s: (s.start, -s.last)):
-        while open_until and open_until[-1] <= one.start:
+    for event in sorted(lane, key=lambda s: (s.start, -s.last)):
+        while open_until and open_until[-1] <= event.start:
             yield _packet(_integer(8, open_until.pop()) + end)
-        if one.end is not None:
-            open_until.append(one.end)
-        begin = [_integer(9, INSTANT if one.end is None else BEGIN), _integer(11, uuid)]
-        begin.append(_text(23, one.name))
-        begin += [_argument(*item) for item in one.arguments.items() if item[1] is not None]
-        for number, flows in ((47, one.flows), (48, one.ends_flows)):
+        if event.end is not None:
+            open_until.append(event.end)
+        begin = [_integer(9, INSTANT if event.end is None else BEGIN), _integer(11, uuid)]
+        begin.append(_text(23, event.name))
+        begin += [_argument(*item) for item in event.arguments.items() if item[1] is not None]
+        for number, flows in ((47, event.flows), (48, event.ends_flows)):
             begin += [_varint(number << 3 | FIXED64) + flow.to_bytes(8, "little") for flow in flows]
-        yield _packet(_integer(8, one.start) + _message(11, b"".join(begin)))
+        yield _packet(_integer(8, event.start) + _message(11, b"".join(begin)))
     while open_until:
         yield _packet(_integer(8, open_until.pop()) + end)
 
 
 def _argument(name: str, value: Value) -> bytes:
+    """Encode an argument of a slice."""
     if isinstance(value, str):
         return _message(4, _text(10, name) + _text(6, value))
     return _message(4, _text(10, name) + _integer(2 if isinstance(value, bool) else 4, value or 0))
@@ -319,9 +325,9 @@ def _message(number: int, content: bytes) -> bytes:
     return _varint(number << 3 | LENGTH) + _varint(len(content)) + content
 
 
-@lru_cache(maxsize=4096)  # names come again and again
+@lru_cache(maxsize=4096)  # most names come often
 def _text(number: int, value: str) -> bytes:
-    """A text as it is shown: it may be a name of others."""
+    """Encode a text, with control characters made visible: it may be a name from a trace."""
     return _message(number, shown(value).encode("utf-8", errors="replace"))
 
 
@@ -330,7 +336,7 @@ def _integer(number: int, value: int) -> bytes:
 
 
 def _varint(value: int) -> bytes:
-    """Seven bits a byte, the lowest first; the eighth says that more follow."""
+    """Encode a number with seven bits a byte, the lowest first; bit eight: more bytes follow."""
     encoded = bytearray()
     while value > 0x7F:
         encoded.append(value & 0x7F | 0x80)

@@ -1,7 +1,7 @@
 """Result tables: written once as plain rows, rendered for the terminal and for the HTML report.
 
-Texts of others (names in traces) stay literal in both: Rich takes brackets for its markup and hands
-control characters on, so on the terminal every text is a `Text`; in HTML every text is escaped.
+Names from traces stay literal in both. Rich takes brackets for its markup and hands control
+characters on, so on the terminal every text is a `Text`; in HTML every text is escaped.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,38 +24,35 @@ Cell: TypeAlias = str | Text
 
 
 class Column(NamedTuple):
-    """``words`` stand at the left and are folded where there is no room, figures at the right.
-
-    A ``detail`` is for the report only: a terminal has no room for it.
-    """
+    """A column of a table."""
 
     title: str
-    words: bool = False
+    words: bool = False  # at the left, folded where there is no room; else figures, at the right
     footer: str = ""
-    detail: bool = False
+    detail: bool = False  # for the report only: a terminal has no room for it
 
 
 def words(*titles: str) -> list[Column]:
-    """Columns of words."""
+    """Make columns of words."""
     return [Column(title, words=True) for title in titles]
 
 
 def figures(*titles: str) -> list[Column]:
-    """Columns of figures."""
+    """Make columns of figures."""
     return [Column(title) for title in titles]
 
 
 class _Row(NamedTuple):
-    """A row; a group's title (``cells`` has it alone); or a line (``cells`` is empty)."""
+    """A row of cells; or the title of a group of rows; or a line between rows."""
 
-    cells: tuple[Cell, ...]
-    detail: bool = False
+    cells: tuple[Cell, ...]  # of a title the single one; of a line none
+    detail: bool = False  # for the report only
     title: bool = False
 
 
 @dataclass
 class ResultTable:
-    """A table of results; print it with Rich, or take its :meth:`html`."""
+    """A table of results, to be printed with Rich or shown as :meth:`html`."""
 
     title: str
     columns: list[Column]
@@ -63,27 +60,27 @@ class ResultTable:
     rows: list[_Row] = field(default_factory=list)
 
     def add(self, *cells: Cell | int | None, detail: bool = False) -> None:
-        """A row: a cell per column. What is not known (None) has a dash."""
-        known = (ABSENT if one is None else one for one in cells)
-        texts = tuple(one if isinstance(one, Text) else str(one) for one in known)
+        """Add a row, with a cell per column; None (not known) is shown as a dash."""
+        known = (ABSENT if cell is None else cell for cell in cells)
+        texts = tuple(cell if isinstance(cell, Text) else str(cell) for cell in known)
         self.rows.append(_Row(texts, detail))
 
     def group(self, title: str, *, detail: bool = False) -> None:
-        """A title over the rows that follow."""
+        """Add a title over the rows that follow."""
         self.rows.append(_Row((title,), detail, title=True))
 
     def line(self) -> None:
-        """A line between the rows before and behind it, on the terminal."""
+        """Add a line between rows, for the terminal."""
         self.rows.append(_Row(()))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """The table for the terminal, without details; where it would break names, in lines."""
+        """Render for the terminal, without details: as a table, or in lines if it is too narrow."""
         table = self._table()
         least = Measurement.get(console, options.update(max_width=9999), table).minimum
-        fits = least <= options.max_width
-        yield from (
-            [table] if fits or all(column.words for column in self.columns) else self._lines()
-        )
+        if least <= options.max_width or all(column.words for column in self.columns):
+            yield table
+        else:
+            yield from self._lines()
 
     def _lines(self) -> Iterator[Text]:
         """Each row in two lines: its words, then its figures under each other."""
@@ -110,6 +107,7 @@ class ResultTable:
             yield plain(self.caption, "table.caption")
 
     def _table(self) -> RichTable:
+        """Make Rich's table, without details."""
         used = [number for number, column in enumerate(self.columns) if not column.detail]
         columns = [self.columns[number] for number in used]
         table = RichTable(
@@ -130,14 +128,14 @@ class ResultTable:
                 indent = "  "
                 table.add_row(plain(cells[0], "bold"))
             elif cells:
-                first, *others = (plain(cells[number]) for number in used)
-                table.add_row(Text(indent) + first, *others)
+                first, *further = (plain(cells[number]) for number in used)
+                table.add_row(Text(indent) + first, *further)
         return table
 
     def html(self) -> str:
-        """The rows as an HTML table, whose first column names them.
+        """Make an HTML table; its first column has the names of rows.
 
-        On a narrow screen each row of a wide table is a paragraph, its cells beside their titles.
+        On a narrow screen each row of a wide table is a paragraph, with titles beside the cells.
         """
         titles = "".join(
             f'<th scope="col"{_kind(column.words or not number)}>{escape(column.title)}</th>'
@@ -145,27 +143,30 @@ class ResultTable:
         )
         body = "\n".join(self._row_html(row) for row in self._with_footer(self.rows))
         return (
-            f'<div class="scroll"><table{" class=wide" * self._wide}>\n'
+            f'<div class="scroll"><table{" class=wide" if self._wide else ""}>\n'
             f"<thead><tr>{titles}</tr></thead>\n"
             f"<tbody>\n{body}\n</tbody></table></div>"
         )
 
     def _with_footer(self, rows: Sequence[_Row]) -> list[_Row]:
-        """Those of the rows that are no lines, and the footer, where there is one."""
+        """The rows without lines, and the footer as the last row if there is one."""
         footer = tuple(column.footer for column in self.columns)
-        return [*(row for row in rows if row.cells), *([_Row(footer)] if any(footer) else [])]
+        shown_rows = [row for row in rows if row.cells]
+        if any(footer):
+            shown_rows.append(_Row(footer))
+        return shown_rows
 
     @property
     def _wide(self) -> bool:
         return len(self.columns) > 4
 
     def _row_html(self, row: _Row) -> str:
-        first, *others = (escape(str(cell)) for cell in row.cells)
+        first, *further = (escape(str(cell)) for cell in row.cells)
         if row.title:
             width = len(self.columns)
             return f'<tr class="group"><th scope="colgroup" colspan="{width}">{first}</th></tr>'
         cells = ""
-        for column, cell in zip(self.columns[1:], others, strict=True):
+        for column, cell in zip(self.columns[1:], further, strict=True):
             titled = f' data-title="{escape(column.title)}"' if self._wide else ""
             cells += f"<td{_kind(column.words)}{titled}>{cell}</td>"
         return f'<tr><th scope="row">{first}</th>{cells}</tr>'
@@ -176,22 +177,22 @@ def _kind(words: bool) -> str:
 
 
 def plain(text: Any, style: str = "") -> Any:
-    """A text for Rich that is shown as it is; what is no text stays."""
+    """Make a text that Rich shows literally; what is no text stays as it is."""
     return Text(shown(text, but="\n"), style) if isinstance(text, str) else text
 
 
 def ms(nanoseconds: float | None) -> str:
-    """Milliseconds, where there are any."""
+    """A time in milliseconds, or a dash."""
     return ABSENT if nanoseconds is None else milliseconds(nanoseconds)
 
 
-def counted(number: int, what: str) -> str:
+def counted(number: int, noun: str) -> str:
     """``1 cycle``, ``2 cycles``."""
-    return f"{number:,} {what}{'' if number == 1 else 's'}"
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def counts(by_kind: Mapping[str, int] | None, absent: str = ABSENT) -> str:
-    """How many there are, and of which kinds: ``3 (2 discard, 1 wait)``."""
+    """A number and its parts by kind: ``3 (2 discard, 1 wait)``."""
     if by_kind is None:
         return absent
     kinds = ", ".join(f"{number} {kind}" for kind, number in by_kind.items())
@@ -199,12 +200,12 @@ def counts(by_kind: Mapping[str, int] | None, absent: str = ABSENT) -> str:
 
 
 def min_mean_max(times: Mapping[str, float] | None) -> list[str]:
-    """Three cells of a struct of times, where there is one."""
+    """Three cells of a struct of times, or three dashes."""
     return [ms(None if times is None else times[name]) for name in ("min", "mean", "max")]
 
 
 def percent(share: float | None) -> str:
-    """A share of one, where there is any."""
+    """A share (of 1) in percent, or a dash."""
     return ABSENT if share is None else f"{share:.1%}"
 
 

@@ -1,11 +1,11 @@
-"""What happened when, thread by thread: the rows that a timeline draws, wherever it is drawn.
+"""The rows of a timeline: what happened when, thread by thread.
 
-The report's page and the trace for Perfetto show the same things: the threads that ran callbacks,
-the callbacks, the messages between them, the slots of the servers, what the gate retained, and
-stalls of the machine. Times are ns of the event clock throughout; :func:`timeline_data`, what a
-page draws of them, counts from the first cycle's start. It has all cycles of a short recording; of
-a long one the longest and the shortest, the median, those without an end, those that were asked for
-by number, and a sample of the others.
+The report's page and the trace for Perfetto draw the same: the threads that ran callbacks, the
+callbacks, the messages between them, the slots of the servers, the messages that the gate held
+back, and stalls of the machine. Times are ns of the event clock. :func:`timeline_data` makes the
+data of the page, with times since the first cycle's start. It has all cycles of a short recording.
+Of a long one it has the longest and the shortest, the median, incomplete ones, those that the user
+asked for by number, and a sample of the others.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -28,18 +28,19 @@ from chainshaper.verify.predictions import due_of
 
 CYCLES = 500
 SLICES = 20_000
-"""How many cycles, and callbacks in them, the page's timeline of one recording has."""
+"""The most cycles, and callbacks in them, in the page's timeline of a recording."""
 
 EXTREMES = 20
-"""How many of the longest cycles, and of the shortest, are among them in any case."""
+"""How many of the longest cycles, and of the shortest, are among them at any rate."""
 
 KINDS = ("cycle", "callback", "unended", "gated", "slot", "stall")
 CYCLE, CALLBACK, UNENDED, GATED, SLOT, STALL = range(len(KINDS))
+"""The kinds of bars in the page's timeline, by number."""
 BARS = ("row", "start", "length", "kind", "cycle", "text", "used")
-"""What bars the page's timeline has, and what is said of each."""
+"""The columns of bars, see :func:`timeline_data`."""
 
 FAR = 10**15
-"""Outside every recording: 11 days."""
+"""An instant outside every recording: 11 days (ns)."""
 
 Bar: TypeAlias = tuple[int, int, int, int, int, str, int | None]
 Windows: TypeAlias = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
@@ -57,19 +58,25 @@ _SLOTS = {"server": pl.String(), "slot": pl.Int32(), "opens": pl.Int64(), "close
 
 @dataclass(frozen=True)
 class Timeline:
-    """The rows of a timeline.
+    """The rows of a timeline, a frame for each kind. Times are ns of the event clock.
 
-    * ``threads``: ``pid, tid, nodes`` (whose callbacks ran there), ``about`` (how the kernel
-      schedules it, null where unknown); the chain's nodes first, in the chain's order.
-    * ``slices``: ``instance, callback_id, pid, tid, start, end, ended, execution_ns``, sorted by
-      start. Where the end was lost ``ended`` is false and ``end`` that of the data flow's
-      convention: the start of the thread's next instance, or the end of the recording.
-    * ``holds``: what a gate did with the chain's messages: ``traversal, hop, arrival, origin,
-      release, let_go, slot, overrun``; it was to be let go at ``release`` and was at ``let_go``.
-    * ``origins``: ``traversal, origin, assumed``: from when the plan's slots count in its cycle;
-      ``assumed`` where no event says so. Empty without a plan.
-    * ``slots``: ``traversal, server, slot, start, end`` of every server in every such cycle.
-    * ``stalls``: ``core, start, end``.
+    ``threads``
+        ``pid, tid``; ``nodes`` whose callbacks ran there; ``about``, its scheduling class and cores
+        (null: unknown). The chain's nodes come first, in the chain's order.
+    ``slices``
+        ``instance, callback_id, pid, tid, start, end, ended, execution_ns``, sorted by start. Where
+        the end was lost, ``ended`` is false and ``end`` the start of the thread's next instance,
+        or the end of the recording.
+    ``holds``
+        The messages of the chain at gates: ``traversal, hop, arrival, origin, slot, overrun``;
+        ``release``, when the gate was to let it go; ``let_go``, when it did.
+    ``origins``
+        Where the plan's slots count from, by cycle: ``traversal, origin``; ``assumed``, whether no
+        event shows it. Empty without a plan.
+    ``slots``
+        The slots of each server in each such cycle: ``traversal, server, slot, start, end``.
+    ``stalls``
+        ``core, start, end``.
     """
 
     threads: pl.DataFrame
@@ -86,7 +93,7 @@ def timeline_of(
     analysis: LatencyAnalysis | None = None,
     plan: ChainPlan | None = None,
 ) -> Timeline:
-    """The timeline of a recording; cycles and slots are those of ``analysis`` and ``plan``."""
+    """Make the timeline of a recording, with cycles of ``analysis`` and slots of ``plan``."""
     times = flow.instances["start"], flow.instances["end"], flow.publications["time"]
     following = pl.col("start").shift(-1).over("pid", "tid")
     slices = flow.instances.sort("start", maintain_order=True).select(
@@ -98,8 +105,12 @@ def timeline_of(
     holds = pl.DataFrame(schema=_GATED) if analysis is None else analysis.releases.select(*_GATED)
     origins = _origins(analysis, plan)
     servers = () if plan is None else plan.servers
-    slots = [(one.name, n, *slot) for one in servers for n, slot in enumerate(one.slots)]
-    # Cycles that two traversals share (the gate counts from its own) are drawn once.
+    slots = [
+        (server.name, number, *slot)
+        for server in servers
+        for number, slot in enumerate(server.slots)
+    ]
+    # Two traversals may share a cycle of the gate: its slots are drawn once.
     cycles = origins.unique("origin", keep="first", maintain_order=True)
     opened = cycles.join(
         pl.DataFrame(slots, schema=_SLOTS, orient="row"), how="cross", maintain_order="left_right"
@@ -121,25 +132,29 @@ def timeline_of(
 def _threads(
     recording: Recording, flow: DataFlow, slices: pl.DataFrame, analysis: LatencyAnalysis | None
 ) -> pl.DataFrame:
+    """Make the frame ``threads`` of :class:`Timeline`."""
     chain = () if analysis is None else analysis.chain.callbacks
     place = pl.col("callback_id").replace_strict(
         list(chain), list(range(len(chain))), default=len(chain), return_dtype=pl.Int32
     )
     owners = flow.objects.callbacks.select("callback_id", "node").unique("callback_id")
     about = {
-        (one.pid, one.tid): f"{one.policy} {one.priority}, {cores_text(one.cores)}"
-        for one in recording.info.threads
+        (thread.pid, thread.tid): f"{thread.policy} {thread.priority}, {cores_text(thread.cores)}"
+        for thread in recording.info.threads
     }
     nodes = pl.col("node").drop_nulls().unique().sort().str.join(", ")
-    found = slices.join(owners, on="callback_id", how="left").group_by("pid", "tid")
-    rows = found.agg(nodes=nodes, place=place.min()).sort("place", "nodes", "pid", "tid")
+    by_thread = slices.join(owners, on="callback_id", how="left").group_by("pid", "tid")
+    rows = by_thread.agg(nodes=nodes, place=place.min()).sort("place", "nodes", "pid", "tid")
     texts = [about.get(key) for key in rows.select("pid", "tid").iter_rows()]
     return rows.drop("place").with_columns(pl.Series("about", texts, dtype=pl.String))
 
 
 def _origins(analysis: LatencyAnalysis | None, plan: ChainPlan | None) -> pl.DataFrame:
-    """The gate says from when it counted; else the chain's stamp, or where cycles seem to start
-    (:mod:`chainshaper.analysis.disturbance`)."""
+    """Make the frame ``origins`` of :class:`Timeline`.
+
+    A gate's decision has the origin. Without one it is the chain's start, or the start of its cycle
+    (:func:`~chainshaper.analysis.disturbance.lateness_in_cycle`).
+    """
     if analysis is None or plan is None:
         return pl.DataFrame(schema=_ORIGINS)
     decided = analysis.decided.select("traversal", decided="origin")
@@ -158,12 +173,17 @@ def _origins(analysis: LatencyAnalysis | None, plan: ChainPlan | None) -> pl.Dat
 def timeline_data(
     measurement: Measurement, timeline: Timeline, cycles: Sequence[int], zero: int
 ) -> dict[str, Any]:
-    """What the page draws around its cycles, and which of them it opens.
+    """Make the data of the page's timeline. Times are in ns since ``zero``.
 
-    ``rows`` are the chain, threads, servers and cores, each with a remark; ``gaps`` are stretches
-    of which the page has nothing. Bars are in the columns of :data:`BARS`: ``kind`` is the number
-    of one of :data:`KINDS`, ``cycle`` -1 where it is of none, ``text`` its number in ``texts``,
-    ``used`` the execution time.
+    * ``rows``: the chain, threads, servers and cores, each with a remark.
+    * ``row, start, length, kind, cycle, text, used``: the columns of bars (:data:`BARS`): number of
+      the row; start and length; number in :data:`KINDS`; number of the cycle (-1: none); number in
+      ``texts``; execution time.
+    * ``texts``: of bars.
+    * ``gaps``: stretches of which the page has no data.
+    * ``cycles``, ``hops``: the cycles in the page, and the names of their hops.
+    * ``of``: how many cycles there are.
+    * ``chosen``: which cycles the page offers to open first.
     """
     analysis = measurement.analysis
     chosen = _chosen(analysis.traversals, measurement.recording.info.worst_ns)
@@ -174,8 +194,11 @@ def timeline_data(
     stalls = _inside(timeline.stalls.sort("start"), windows)
     servers = () if measurement.plan is None else measurement.plan.servers
     rows = [("chain", ""), *timeline.threads.select("nodes", pl.col("about").fill_null("")).rows()]
-    of_server = {one.name: number for number, one in enumerate(servers, start=len(rows))}
-    rows += [(f"server {one.name}", f"core {one.core}, priority {one.priority}") for one in servers]
+    of_server = {server.name: number for number, server in enumerate(servers, start=len(rows))}
+    rows += [
+        (f"server {server.name}", f"core {server.core}, priority {server.priority}")
+        for server in servers
+    ]
     of_core = {core: number for number, core in enumerate(dict.fromkeys(stalls["core"]), len(rows))}
     rows += [("stalls" if core is None else f"stalls of core {core}", "") for core in of_core]
 
@@ -188,7 +211,7 @@ def timeline_data(
         .sort("traversal", "hop")
         .select("traversal", "hop", "row", *times)
     )
-    labels = {one.id: analysis.graph.label(one) for one in analysis.graph.callbacks}
+    labels = {callback.id: analysis.graph.label(callback) for callback in analysis.graph.callbacks}
     slices = (
         _inside(timeline.slices, windows)
         .join(threads, on=["pid", "tid"], maintain_order="left")
@@ -221,7 +244,7 @@ def _bars(
     hops: pl.DataFrame,
     of_server: dict[str, int],
 ) -> Iterator[Bar]:
-    """Cycles, callbacks, what gates did, and slots: what comes later covers what was before."""
+    """Yield bars for cycles, callbacks, gates and slots; later ones are drawn over earlier ones."""
     columns = ["traversal", "start", "latency_ns", "disturbed"]
     for cycle, start, latency, hit in traversals.filter("complete").select(columns).iter_rows():
         text = f"cycle {cycle}{', disturbed by the machine' if hit else ''}"
@@ -235,7 +258,7 @@ def _bars(
     for row, cycle, arrival, let_go, overrun in gated.select(columns).iter_rows():
         text = f"cycle {cycle}: in the gate{f', overran: {overrun}' if overrun else ''}"
         yield row, arrival, let_go - arrival, GATED, cycle, text, None
-    # A cycle that two traversals share has its slots once, with either of them.
+    # If two traversals share a cycle, its slots are drawn once, with whichever is in the page.
     shown = timeline.origins.join(traversals.select("traversal"), on="traversal", how="semi")
     slots = timeline.slots.join(timeline.origins, on="traversal", maintain_order="left").join(
         shown, on="origin", how="semi", maintain_order="left"
@@ -243,41 +266,48 @@ def _bars(
     columns = ["server", "traversal", "start", "end", "origin", "assumed"]
     for server, cycle, start, end, origin, assumed in slots.select(columns).iter_rows():
         text = f"server {server}, cycle {cycle}\n{slots_ms((start - origin, end - origin))} ms"
-        text += "\nthe cycle's start is not recorded but assumed" if assumed else ""
+        if assumed:
+            text += "\nthe cycle's start is not recorded but assumed"
         yield of_server[server], start, end - start, SLOT, cycle, text, None
 
 
 def _cycles(
     traversals: pl.DataFrame, hops: pl.DataFrame, slots: pl.DataFrame, zero: int
 ) -> Iterator[dict[str, Any]]:
-    """Each cycle in the page; its hops ``[row, take, start, publish, end]`` count from its start,
-    and ``length`` is the time that it takes on the timeline, with its servers' slots."""
+    """Yield each cycle in the page. Times are in ns.
+
+    Its ``hops`` are ``[row, take, start, publish, end]``, counted from its start. Its ``length`` is
+    the time that it takes on the timeline, with its servers' slots.
+    """
     closes = dict(slots.group_by("traversal").agg(pl.col("end").max()).iter_rows())
     hops_of: dict[int, list[list[int | None]]] = {}
     for traversal, _, *hop in hops.iter_rows():
         hops_of.setdefault(traversal, []).append(hop)
     for row in traversals.iter_rows(named=True):
         number, start = row["traversal"], row["start"]
-        own = hops_of.get(number, [])
+        hops_of_cycle = hops_of.get(number, [])
         state = f"incomplete: {row['reason']} ({row['broken_at']})"
         about = f"{ms(row['latency_ns'])} ms" if row["complete"] else state
-        about += ", disturbed by the machine" if row["disturbed"] else ""
+        if row["disturbed"]:
+            about += ", disturbed by the machine"
         received = 0
         if row["received"] is not None:
             received = row["received"] - start
             about += f"; {ms(received)} ms at the subscriber"
         about += f"; began {(start - zero) / 1e9:.3f} s after the first"
-        cycle = {"n": number, "start": start - zero, "hops": own, "about": about}
+        cycle = {"n": number, "start": start - zero, "hops": hops_of_cycle, "about": about}
         if row["complete"]:
             cycle["latency"] = row["latency_ns"]
-        ends = [time for hop in own for time in hop[2:] if time is not None]
+        ends = [time for hop in hops_of_cycle for time in hop[2:] if time is not None]
         ends += [row["latency_ns"] or 0, received, closes.get(number, start) - start]
         yield {**cycle, "length": max(1000, *ends)}
 
 
 def _chosen(traversals: pl.DataFrame, worst_ns: Sequence[int]) -> dict[str, int]:
-    """The longest, median and shortest undisturbed cycle, of all complete if all are disturbed; and
-    that for which the recording was written, which the page shows first.
+    """Choose the longest, median and shortest cycle, and the first one that the page shows.
+
+    They are undisturbed, unless all complete ones are disturbed. The first is the cycle for which
+    a watch wrote the recording, if there is one.
     """
     worst = traversals.filter(pl.col("start").is_in(worst_ns))["traversal"]
     first = {"first": int(worst[0])} if len(worst) else {}
@@ -294,12 +324,15 @@ def _chosen(traversals: pl.DataFrame, worst_ns: Sequence[int]) -> dict[str, int]
 def _cycles_in_page(
     traversals: pl.DataFrame, slices: float, asked: Sequence[int], chosen: Iterable[int]
 ) -> list[int]:
-    """All cycles where they are few; else those asked for, extremes, incomplete, and a sample."""
+    """Choose the cycles in the page: all if they are few, else a selection.
+
+    These are the ones asked for, the chosen, extremes, incomplete ones, and a sample of all.
+    """
     room = max(2 * EXTREMES + 1, min(CYCLES, int(SLICES / max(1.0, slices))))
-    every = traversals["traversal"].to_list()
-    if len(every) <= room:
-        return every
-    known = set(every)
+    all_cycles = traversals["traversal"].to_list()
+    if len(all_cycles) <= room:
+        return all_cycles
+    known = set(all_cycles)
     ordered = traversals.filter("complete").sort("latency_ns", maintain_order=True)["traversal"]
     candidates = [
         *(cycle for cycle in asked if cycle in known),
@@ -307,13 +340,13 @@ def _cycles_in_page(
         *ordered.tail(EXTREMES),
         *ordered.head(EXTREMES),
         *traversals.filter(~pl.col("complete"))["traversal"].head(EXTREMES),
-        *every[:: max(1, len(every) // room)],
+        *all_cycles[:: max(1, len(all_cycles) // room)],
     ]
     return sorted(list(dict.fromkeys(candidates))[: room + len(asked)])
 
 
 def _windows(traversals: pl.DataFrame, timeline: Timeline) -> Windows:
-    """From a little before each cycle to a little behind its output's reception; merged."""
+    """Windows from a little before each cycle to a little after its output's reception, merged."""
     slots = timeline.slots.group_by("traversal").agg(closes=pl.col("end").max())
     rows = traversals.join(slots, on="traversal", how="left", maintain_order="left")
     usual = rows["latency_ns"].median()
@@ -327,5 +360,6 @@ def _windows(traversals: pl.DataFrame, timeline: Timeline) -> Windows:
 
 
 def _inside(slices: pl.DataFrame, windows: Windows) -> pl.DataFrame:
+    """Select the rows whose time from ``start`` to ``end`` meets a window."""
     start, end = slices["start"].to_numpy(), slices["end"].to_numpy()
     return slices.filter(pl.Series(overlapping(start, end, *windows), dtype=pl.Boolean))

@@ -74,7 +74,7 @@ def release_of(
         >>> moved = [Schedule(0, phase_ns=0), Schedule(1050, phase_ns=0, moved_ns=10)]
         >>> release_of(gate, 1140, 1100, moved).at_ns
         1170
-        >>> modes = Modes(bands={"city": 1, "highway": 0}, default="city", late="next-slot")
+        >>> modes = GateModes(slots={"city": 1, "highway": 0}, default="city", late="next-slot")
         >>> gate = Gate(slots=((20, 21), (60, 61)), cycle_ns=100, modes=modes)
         >>> release_of(gate, 1110, 1100, [Schedule(1050, phase_ns=0, mode="highway")]).at_ns
         1120
@@ -91,7 +91,7 @@ def release_of(
     mode, first, slots = None, 0, gate.slots
     if modes is not None:
         mode = schedule_in_force(schedules, origin).mode or modes.default
-        first = modes.bands[mode]
+        first = modes.slots[mode]
         slots = slots[first : None if modes.late == "next-slot" else first + 1]
     ready = arrival_ns if ready_ns is None else max(arrival_ns, ready_ns)
     # A stamp slightly from the future puts the arrival before its own cycle: cycle 0 still.

@@ -23,8 +23,8 @@ single files that :mod:`chainshaper.splicing` puts together from them.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Annotated, Literal, NamedTuple, TypeAlias, get_args, get_origin
+from dataclasses import Field, dataclass, fields
+from typing import Annotated, Any, Literal, NamedTuple, TypeAlias, get_args, get_origin
 
 Anchor: TypeAlias = Literal["stamp", "cycle"]
 Overrun: TypeAlias = Literal["wait", "discard", "publish"]
@@ -45,30 +45,38 @@ def _one_of(key: str, word: str, known: Sequence[str]) -> None:
 
 
 @dataclass(frozen=True)
-class Modes:
+class GateModes:
     """The slot that the messages of each mode of the system leave in.
 
-    * ``bands``: the place of each mode's slot in the gate's ``slots``, from 0.
+    * ``slots``: the place of each mode's slot among the gate's, from 0. Users number them from 1,
+      as bands of a plan.
     * ``default``: the mode in force until one is announced.
     * ``late``: what happens to a message behind its mode's slot; with ``next-slot`` one that comes
       behind the last slot is still an overrun.
     """
 
-    bands: Mapping[str, int]
+    slots: Mapping[str, int]
     default: str
     late: str = "wait"
 
     def __post_init__(self) -> None:
-        if self.default not in self.bands:
-            choose = f"choose one of {', '.join(self.bands)}"
+        if self.default not in self.slots:
+            choose = f"choose one of {', '.join(self.slots)}"
             raise ValueError(f"the default mode {self.default!r} has no band: {choose}")
         _one_of("late", self.late, LATE)
 
 
 class AtLeast(NamedTuple):
-    """The smallest value of a number."""
+    """The smallest value of a number, and what is said of a smaller one."""
 
     number: int
+    otherwise: str
+
+
+def limit_of(declared: "Field[Any]") -> AtLeast | None:
+    """Return the limit of a field; None: it has none."""
+    limits = (limit for limit in get_args(declared.type) if isinstance(limit, AtLeast))
+    return next(limits, None)
 
 
 @dataclass(frozen=True)
@@ -100,26 +108,25 @@ class Gate:
     """
 
     slots: tuple[tuple[int, int], ...]
-    cycle_ns: Annotated[int, AtLeast(1)]
+    cycle_ns: Annotated[int, AtLeast(1, "cycle of {} ns: it must be longer than nothing")]
     anchor: Anchor = "stamp"
     phase_ns: int = 0
     overrun: Overrun = "wait"
-    due_cycles: Annotated[int, AtLeast(0)] = 0
-    modes: Modes | None = None
+    due_cycles: Annotated[int, AtLeast(0, "due {} cycles later: no message is due beforehand")] = 0
+    modes: GateModes | None = None
     messages: Messages = "all-in-order"
-    depth: Annotated[int, AtLeast(1)] = DEPTH
+    depth: Annotated[int, AtLeast(1, "room for {} messages: a gate needs it for one at least")] = (
+        DEPTH
+    )
     into_open_slot: IntoOpenSlot = "at-once"
 
     def __post_init__(self) -> None:
         for declared in fields(self):
+            value, limit = getattr(self, declared.name), limit_of(declared)
             if get_origin(declared.type) is Literal:
-                _one_of(declared.name, getattr(self, declared.name), get_args(declared.type))
-        if self.depth < 1:
-            raise ValueError(f"room for {self.depth} messages: a gate needs it for one at least")
-        if self.due_cycles < 0:
-            raise ValueError(f"due {self.due_cycles} cycles later: no message is due beforehand")
-        if self.cycle_ns <= 0:
-            raise ValueError(f"cycle of {self.cycle_ns} ns: it must be longer than nothing")
+                _one_of(declared.name, value, get_args(declared.type))
+            if limit is not None and value < limit.number:
+                raise ValueError(limit.otherwise.format(value))
         if not self.slots:
             raise ValueError("a gate without slots would never let anything through")
         previous_end = 0
@@ -128,10 +135,10 @@ class Gate:
                 rule = "slots must ascend, not overlap and lie within the cycle"
                 raise ValueError(f"slot [{start}, {end}) ns: {rule}")
             previous_end = end
-        for mode, band in ({} if self.modes is None else self.modes.bands).items():
-            if not 0 <= band < len(self.slots):
-                known = f"slots are numbered 0 to {len(self.slots) - 1}"
-                raise ValueError(f"mode {mode!r}: band {band}, but {known}")
+        for mode, place in ({} if self.modes is None else self.modes.slots).items():
+            if not 0 <= place < len(self.slots):
+                known = f"bands are numbered 1 to {len(self.slots)}"
+                raise ValueError(f"mode {mode!r}: band {place + 1}, but {known}")
 
     def may_move(self, by_ns: int) -> bool:
         """Return whether slots that are moved by this time still lie within the cycle."""

@@ -374,7 +374,7 @@ class Turn:
 
         From now on the page shows each of its decisions, and changes its schedule.
         """
-        modes = [] if shaper.gate.modes is None else [*shaper.gate.modes.bands]
+        modes = [] if shaper.gate.modes is None else [*shaper.gate.modes.slots]
         queue, cycle_ns = shaper.queue, shaper.gate.cycle_ns
 
         def decided(release: Release) -> None:
@@ -419,6 +419,14 @@ class Turn:
             return False
         self.page["taken"] += 1  # which tells the standby that this node does not hang
         return True
+
+    def is_overtaken_by(self, key: int | None) -> bool:
+        """Return whether the standby has dealt with this message, which is behind the one in hand.
+
+        The one in hand would come after it. The standby, which started later than this node, did
+        not receive the one in hand. To be called after :meth:`was_bypassed`.
+        """
+        return key in self._bypassed
 
     def done(self, key: int | None) -> None:
         """Note that a message has been published or discarded."""

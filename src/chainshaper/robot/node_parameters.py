@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any, Literal, get_origin
 
-from chainshaper.robot.gate import DEPTH, VALUES, Gate, Modes, values_of
+from chainshaper.robot.gate import DEPTH, VALUES, Gate, GateModes, values_of
 
 
 def _parameters_of_gates() -> dict[str, tuple[Any, Any]]:
@@ -20,9 +20,9 @@ def _parameters_of_gates() -> dict[str, tuple[Any, Any]]:
         parameters[declared.name] = type_, default
     return parameters | {
         "mode_names": (list[str], []),
-        "mode_slots": (list[int], []),  # the place of each mode's slot, from 0
+        "mode_slots": (list[int], []),  # which slot each mode has, from 1
         "mode_default": (str, ""),
-        "mode_late": (str, Modes.late),
+        "mode_late": (str, GateModes.late),
     }
 
 
@@ -91,8 +91,9 @@ class NodeParameters:
         values = self.gate_values
         modes, bounds = None, values["slots_ns"]
         if self.mode_topic:
-            bands = dict(zip(values["mode_names"], values["mode_slots"], strict=True))
-            modes = Modes(bands, values["mode_default"], values["mode_late"])
+            places = [number - 1 for number in values["mode_slots"]]
+            slots = dict(zip(values["mode_names"], places, strict=True))
+            modes = GateModes(slots, values["mode_default"], values["mode_late"])
         return Gate(
             slots=tuple(zip(bounds[::2], bounds[1::2], strict=False)),
             modes=modes,
@@ -129,8 +130,8 @@ def gate_parameters(gate: Gate, mode_topic: str = "") -> dict[str, Any]:
     if (modes := gate.modes) is not None:
         parameters |= {
             "mode_topic": mode_topic,
-            "mode_names": [*modes.bands],
-            "mode_slots": [*modes.bands.values()],
+            "mode_names": [*modes.slots],
+            "mode_slots": [place + 1 for place in modes.slots.values()],
             "mode_default": modes.default,
             "mode_late": modes.late,
         }

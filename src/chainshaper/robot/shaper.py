@@ -100,7 +100,8 @@ class Shaper:
                 sleep_until(min(awake, now + LOOK_NS))
                 self._look()
                 now = time.monotonic_ns()
-            if not slept and self.gate.messages == "newest":
+            # The first time, it may have come long ago, and newer ones since.
+            if not slept and (self.gate.messages == "newest" or not self._looked_ns):
                 self._look()
             if queue.waiting[0] is not message:
                 return None

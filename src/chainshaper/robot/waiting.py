@@ -90,7 +90,7 @@ class Queue:
 
         Returns False if there is no such mode.
         """
-        if self.gate.modes is None or mode is None or mode not in self.gate.modes.bands:
+        if self.gate.modes is None or mode is None or mode not in self.gate.modes.slots:
             return False
         self.schedules = with_change(self.schedules, from_ns, mode=mode)
         return True

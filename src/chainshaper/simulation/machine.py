@@ -355,10 +355,10 @@ class Machine:
         description.phase_ns = timing.anchor_ns
         if gate.phase_ns is not None:
             description.phase_ns = timing.start_ns + gate.phase_ns
-        if (modes := gate.modes) is not None:
-            description.mode_names = list(modes.bands)
-            description.bands = list(modes.bands.values())
-            description.modes = [self._system.modes.index(mode) for mode in modes.bands]
+        if (modes := gate.gate().modes) is not None:
+            description.mode_names = list(modes.slots)
+            description.mode_slots = list(modes.slots.values())
+            description.modes = [self._system.modes.index(mode) for mode in modes.slots]
             description.first_mode = description.mode_names.index(modes.default)
             description.late = modes.late
         return description

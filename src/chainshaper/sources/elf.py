@@ -18,17 +18,18 @@ _NO_ELF = (OSError, LookupError, struct.error, ValueError)
 
 
 def exported_functions(path: Path) -> frozenset[str]:
-    """The functions in an ELF-64 file's dynamic symbol table; none if it is no such file."""
+    """Return the functions in an ELF-64 file's dynamic symbol table; none if it is no such file."""
     with suppress(*_NO_ELF):
         return frozenset(name for _, name in _functions(read_regular(path), (_DYNSYM,)))
     return frozenset()
 
 
 def function_offsets(path: Path) -> dict[int, str]:
-    """Where functions begin in a file, in bytes, and their names; also of those not exported."""
+    """Return where functions begin in a file, in bytes, and their names, exported or not."""
     with suppress(*_NO_ELF):
         content = read_regular(path)
-        loaded = [s[2:6] for s in _entries(content, 32, 54, "IIQQQQQQ") if s[0] == _LOAD]
+        segments = _entries(content, 32, 54, "IIQQQQQQ")
+        loaded = [segment[2:6] for segment in segments if segment[0] == _LOAD]
         return {
             address - memory + offset: name
             for address, name in _functions(content, (_DYNSYM, _SYMTAB))
@@ -39,7 +40,7 @@ def function_offsets(path: Path) -> dict[int, str]:
 
 
 def _entries(content: bytes, at: int, count_at: int, layout: str) -> Iterator[tuple[int, ...]]:
-    """The table of which the file's header says at these places where it is, and how long."""
+    """Yield the entries of a table: the header says at ``at`` where it is, then how long."""
     if content[:5] != b"\x7fELF\x02":
         raise ValueError("no ELF-64 file")
     order = {1: "<", 2: ">"}[content[5]]
@@ -50,7 +51,7 @@ def _entries(content: bytes, at: int, count_at: int, layout: str) -> Iterator[tu
 
 
 def _functions(content: bytes, tables: tuple[int, ...]) -> Iterator[tuple[int, str]]:
-    """Addresses and names of the functions that a file's symbol tables define."""
+    """Yield addresses and names of the functions that a file's symbol tables define."""
     sections = list(_entries(content, 40, 58, "IIQQQQIIQQ"))
     layout = {1: "<IBBHQ", 2: ">IBBHQ"}[content[5]]
     for _, kind, _, _, start, length, names, *_ in sections:
@@ -62,6 +63,9 @@ def _functions(content: bytes, tables: tuple[int, ...]) -> Iterator[tuple[int, s
 
 
 def mapped_regions(pid: int) -> Iterator[Region]:
-    """The regions that files are mapped to, by address. Raises OSError: gone, or another user's."""
+    """Return the regions that files are mapped to, by address.
+
+    Raises OSError: the process is gone, or another user's.
+    """
     regions = regions_in(read_proc(f"/proc/{pid}/maps"))
-    return (one for one in regions if one.path.startswith("/"))
+    return (region for region in regions if region.path.startswith("/"))

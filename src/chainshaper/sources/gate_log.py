@@ -19,24 +19,25 @@ _TYPES = events.column_types("gate_release")
 
 
 def read_gate_log(path: str | Path) -> pl.DataFrame:
-    """The event table ``gate_release`` of a shaping node's log, and of ``….1``, sorted by time.
+    """Return the event table ``gate_release`` of a shaping node's log, and of ``….1``, by time.
 
     ``callback`` is null. A last line that is not whole is left out. Raises InputError: no such
     file, or it is no shaping node's log.
     """
     path = Path(path)
-    # Rows have numbers: two alike are one row, in a log and a copy of it.
+    # Rows have numbers: where two are equal, it is one row, in a log and a copy of it.
     table = pl.concat(map(_read_part, _parts(path) or [path])).unique(maintain_order=True)
     return table.with_columns(gate=pl.lit(path.stem)).sort("time", maintain_order=True)
 
 
 def _parts(path: Path) -> list[Path]:
-    """The files of a log that are there, but for one for which the disk had no room."""
+    """Return the files of a log that are there; an empty one is none: the disk had no room."""
     before = path.with_name(f"{path.name}.1")
-    return [one for one in (before, path) if one.is_file() and one.stat().st_size]
+    return [file for file in (before, path) if file.is_file() and file.stat().st_size]
 
 
 def _read_part(path: Path) -> pl.DataFrame:
+    """Return the rows of one file of a log. Raises InputError: it is none."""
     try:
         text = path.read_bytes()
     except OSError as error:
@@ -44,8 +45,10 @@ def _read_part(path: Path) -> pl.DataFrame:
     whole = text[: text.rfind(b"\n") + 1]
     names = whole.split(b"\n", 1)[0].decode(errors="replace").split(",")
     if set(LOG_COLUMNS) - {*_LATER, *names} or set(names) - set(LOG_COLUMNS):
-        what = "this is not the log of a shaping node, which begins with the names of its columns"
-        raise InputError(f"{path}:1: {what}: name the file that the node's parameter `log` names")
+        raise InputError(
+            f"{path}:1: this is not the log of a shaping node, which begins with the names of its"
+            " columns: name the file that the node's parameter `log` names"
+        )
     try:
         table = pl.read_csv(whole, schema={name: _TYPES[name] for name in names})
     except pl.exceptions.PolarsError as error:
@@ -54,7 +57,7 @@ def _read_part(path: Path) -> pl.DataFrame:
 
 
 def rows_missing(releases: pl.DataFrame) -> tuple[int, int]:
-    """How many rows of logs are in no file: removed to make room, and never written.
+    """Return how many rows of logs are in no file: removed to make room, and never written.
 
     Rows are numbered from 1 since a gate began; logs of before are taken to be whole.
     """
@@ -66,19 +69,19 @@ def rows_missing(releases: pl.DataFrame) -> tuple[int, int]:
 
 
 def releases_so_far(logs: Iterable[Path]) -> npt.NDArray[np.int64]:
-    """The latest planned releases (ns) of shaping nodes that are at work, at most 100 of each."""
-    found = [np.empty(0, dtype=np.int64)]
+    """Return the latest planned releases (ns) of running shaping nodes, at most 100 of each."""
+    latest = [np.empty(0, dtype=np.int64)]
     for log in logs:
         with contextlib.suppress(InputError):  # not there yet, or nothing is in it
             releases = read_gate_log(log).filter(pl.col("slot").is_not_null())
-            found.append(releases["release"].drop_nulls().tail(100).to_numpy())
-    return np.concatenate(found)
+            latest.append(releases["release"].drop_nulls().tail(100).to_numpy())
+    return np.concatenate(latest)
 
 
 def with_gate_logs(
     tables: events.EventTables, logs: Sequence[Path], since_ns: int, until_ns: int
 ) -> tuple[events.EventTables, tuple[str, ...]]:
-    """Event tables with `gate_release` and stalls from the logs of shaping nodes; and notes.
+    """Add `gate_release`, and stalls, from the logs of shaping nodes to event tables; and notes.
 
     Cycles count that began at ``since_ns`` or later, and whose message was let go before
     ``until_ns`` (CLOCK_MONOTONIC). Raises InputError: no such log.

@@ -24,7 +24,7 @@ def table_of_registers(
     *,
     version: str | None,
 ) -> pl.DataFrame:
-    """The table of an event, sorted by time.
+    """Return the table of an event, sorted by time.
 
     * ``places``: fields, and in which register each is, from 0; a gid is in two of them.
     * ``common``: a row for each event, with the columns that all tables begin with.
@@ -47,10 +47,12 @@ def table_of_registers(
     frame = common.with_columns(**columns)
     if event == "rcl_init":
         frame = frame.with_columns(version=pl.lit(version, pl.String))
-    types = {n: t for n, t in events.column_types(event).items() if n in frame.columns}
-    return frame.select(
-        pl.col(n).reinterpret(signed=True)
-        if t == pl.Int64() and frame.schema[n] == pl.UInt64()
-        else pl.col(n).cast(t)
-        for n, t in types.items()
-    ).sort("time", maintain_order=True)
+    columns_as_declared = []
+    for name, dtype in events.column_types(event).items():
+        if name not in frame.columns:
+            continue
+        if dtype == pl.Int64() and frame.schema[name] == pl.UInt64():
+            columns_as_declared.append(pl.col(name).reinterpret(signed=True))
+        else:
+            columns_as_declared.append(pl.col(name).cast(dtype))
+    return frame.select(columns_as_declared).sort("time", maintain_order=True)

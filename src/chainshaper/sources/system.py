@@ -18,8 +18,14 @@ NEXT_HOST = 10_000_000
 """Added to numbers of processes and threads that others may have; Linux goes up to 4,194,304."""
 
 _RELEASES = {  # Versions of tracetools below these belong to the distribution.
-    **{"eloquent": (1, 0), "foxy": (2, 0), "galactic": (3, 0), "humble": (5, 0), "iron": (7, 0)},
-    **{"jazzy": (8, 3), "kilted": (8, 7), "lyrical": (8, 11)},
+    "eloquent": (1, 0),
+    "foxy": (2, 0),
+    "galactic": (3, 0),
+    "humble": (5, 0),
+    "iron": (7, 0),
+    "jazzy": (8, 3),
+    "kilted": (8, 7),
+    "lyrical": (8, 11),
 }
 
 
@@ -31,8 +37,11 @@ def info_of(
     lost: int,
     **facts: Any,
 ) -> RecordingInfo:
-    """What we trace: ``versions`` of tracetools, ``names`` of processes without nodes."""
-    known = pl.DataFrame({"version": [one for one in versions if one][:1]})
+    """Return the information of a recording that we traced.
+
+    ``versions`` are those of tracetools, ``names`` those of processes without nodes.
+    """
+    known = pl.DataFrame({"version": [version for version in versions if version][:1]})
     return RecordingInfo(
         source=source,
         distribution=distribution_of({"rcl_init": known}, {}),
@@ -44,25 +53,25 @@ def info_of(
 
 
 def own_pid_namespace() -> int:
-    """The pid namespace whose numbers we see processes under (its inode)."""
+    """Return the pid namespace whose numbers we see processes under (its inode)."""
     return Path("/proc/self/ns/pid").stat().st_ino
 
 
 def distribution_of(
     tables: EventTables, fields: Mapping[str, Collection[str]], gid_length: int = 0
 ) -> str | None:
-    """The ROS 2 distribution as `ROS_DISTRO` has it (``jazzy``), None if nothing tells.
+    """Return the ROS 2 distribution as `ROS_DISTRO` has it (``jazzy``); None: nothing shows it.
 
     CARET's `caret_init` says it, or `rcl_init` by the version of tracetools. Else the declared
     events' ``fields``: `rmw_publish` has a source timestamp since Jazzy, a gid 16 bytes instead of
     24 since Kilted, intra-process events came with Iron.
     """
-    said = _first(tables, "caret_init", "distribution")
-    if said is not None:
-        return said
-    found = re.match(r"(\d+)\.(\d+)", _first(tables, "rcl_init", "version") or "")
-    if found is not None:
-        version = int(found[1]), int(found[2])
+    by_caret = _first(tables, "caret_init", "distribution")
+    if by_caret is not None:
+        return by_caret
+    parts = re.match(r"(\d+)\.(\d+)", _first(tables, "rcl_init", "version") or "")
+    if parts is not None:
+        version = int(parts[1]), int(parts[2])
         return next((name for name, below in _RELEASES.items() if version < below), "rolling")
     if "timestamp" in fields.get("rmw_publish", ()):
         return {24: "jazzy", 16: "kilted"}.get(gid_length)
@@ -72,13 +81,15 @@ def distribution_of(
 
 
 def _first(tables: EventTables, event: str, field: str) -> str | None:
+    """Return what the first event of a name has in a field; None: there is no such event."""
     frame = tables.get(event, pl.DataFrame())
-    found = frame[field].head(1).drop_nulls() if field in frame.columns else ()
-    return next(map(str, found), None)
+    if field not in frame.columns:
+        return None
+    return next(map(str, frame[field].head(1).drop_nulls()), None)
 
 
 def rmw_of_gids(tables: EventTables) -> str | None:
-    """The RMW implementation, from CARET's event, or from the endpoints' gids."""
+    """Return the RMW implementation, from CARET's event, or from the endpoints' gids."""
     named = _first(tables, "rmw_implementation", "rmw_impl")
     if named is not None:
         return named
@@ -91,7 +102,7 @@ def rmw_of_gids(tables: EventTables) -> str | None:
 
 
 def processes_of(tables: EventTables, commands: Mapping[int, str]) -> dict[int, str]:
-    """Process → the nodes it created, else its ``commands`` entry (what the tracer calls it)."""
+    """Return process → the nodes it created, else its ``commands`` entry (its tracer's name)."""
     named = table(tables, "rcl_node_init").select("pid", node=NODE_NAME).drop_nulls()
     nodes = named.unique(maintain_order=True).group_by("pid").agg(pl.col("node").str.join(", "))
     return dict(sorted({**commands, **dict(nodes.iter_rows())}.items()))

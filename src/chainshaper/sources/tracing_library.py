@@ -25,11 +25,11 @@ _OVERLAY = 0x794C7630
 
 @dataclass(frozen=True)
 class TracingLibrary:
-    """A `libtracetools.so`; ``functions`` are those that it exports."""
+    """A `libtracetools.so`."""
 
     path: Path
-    functions: frozenset[str]
-    version: str | None
+    functions: frozenset[str]  # that it exports
+    version: str | None  # of tracetools; None: not known
 
     @property
     def major(self) -> int:
@@ -38,30 +38,32 @@ class TracingLibrary:
 
     @property
     def handles_at_rmw(self) -> bool:
+        """Whether `rmw_publish` has the publisher's handle."""
         return self.major >= 8
 
 
 def installed_libraries(environment: Mapping[str, str]) -> tuple[TracingLibrary, ...]:
-    """The libraries that a command with this environment can find, and all below `/opt/ros`."""
+    """Return the libraries that a command in this environment can find, and all below /opt/ros."""
     prefixes = environment.get("AMENT_PREFIX_PATH", "").split(":")
     folders = [f"{prefix}/lib" for prefix in prefixes if prefix]
     folders += filter(None, environment.get("LD_LIBRARY_PATH", "").split(":"))
     folders += map(str, sorted(_INSTALLATIONS.glob("*/lib")))
     files = [Path(folder, LIBRARY) for folder in folders]
-    return tuple(dict.fromkeys(_found([file.absolute() for file in files if file.is_file()], {})))
+    there = [file.absolute() for file in files if file.is_file()]
+    return tuple(dict.fromkeys(_libraries_at(there, {})))
 
 
 def mapped_libraries(pids: Iterable[int]) -> dict[int, tuple[TracingLibrary, ...]]:
-    """Process → the libraries that it has mapped; only those that have one."""
+    """Return process → the libraries that it has mapped, if any."""
     known: dict[tuple[int, ...], TracingLibrary] = {}
-    found = {pid: tuple(_found(_mapped(pid), known)) for pid in pids}
-    return {pid: libraries for pid, libraries in found.items() if libraries}
+    mapped = {pid: tuple(_libraries_at(_mapped(pid), known)) for pid in pids}
+    return {pid: libraries for pid, libraries in mapped.items() if libraries}
 
 
 def _mapped(pid: int) -> Iterator[Path]:
-    """Files of that name which a process has mapped, by paths that lead there from here."""
+    """Yield the libraries that a process has mapped, by paths that lead there from here."""
     with suppress(OSError):  # it is gone, or another user's
-        paths = {one.path for one in mapped_regions(pid) if f"/{LIBRARY}" in one.path}
+        paths = {region.path for region in mapped_regions(pid) if f"/{LIBRARY}" in region.path}
         for mapped in sorted(paths):
             inside = Path(f"/proc/{pid}/root{mapped}")  # as a container has it
             if inside.is_file():  # else replaced since: its new contents are not what runs
@@ -69,13 +71,13 @@ def _mapped(pid: int) -> Iterator[Path]:
                 yield outside if outside.is_file() and outside.samefile(inside) else inside
 
 
-def _found(
+def _libraries_at(
     paths: Iterable[Path], known: dict[tuple[int, ...], TracingLibrary]
 ) -> Iterator[TracingLibrary]:
-    """The libraries at some paths; ``known`` has them by what uprobes are set in.
+    """Yield the libraries at some paths; ``known`` has those that were seen before.
 
-    That is a device's inode. Containers of one image share it, each through an overlay of its own:
-    a probe in every one of these would fire for all.
+    Uprobes are set in a device's inode, so that is their key. Containers of one image share it,
+    each through an overlay of its own: a probe in every one of these would fire for all.
     """
     for path in paths:
         status = path.stat()
@@ -88,17 +90,17 @@ def _found(
 
 
 def _is_overlaid(path: Path) -> bool:
-    """Whether an overlay shows the file. Upstream: statfs(2), OVERLAYFS_SUPER_MAGIC."""
+    """Return whether an overlay shows the file. Upstream: statfs(2), OVERLAYFS_SUPER_MAGIC."""
     status = ctypes.create_string_buffer(256)
     ctypes.CDLL(None).statfs(os.fsencode(path), status)
     return int.from_bytes(status.raw[:4], sys.byteorder) == _OVERLAY
 
 
 def version_of(library: Path) -> str | None:
-    """The version of tracetools, as its package says beside the library; None if none does."""
+    """Return the version of tracetools, by its package beside the library; None: there is none."""
     for folder in library.parents[1:3]:  # `lib`, or `lib/x86_64-linux-gnu`, is in the prefix
         with suppress(OSError):
             package = read_regular(folder / "share/tracetools/package.xml", _LONGEST_PACKAGE)
-            if found := _VERSION.search(package.decode(errors="replace")):
-                return found[1]
+            if version := _VERSION.search(package.decode(errors="replace")):
+                return version[1]
     return None

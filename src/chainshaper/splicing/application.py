@@ -195,7 +195,7 @@ def _described(plan: ChainPlan, shaping: ShapingNode, depth: int, phase_ns: int)
     described: dict[str, Any] = {**values_of(gate), "slots": gate.slots, "depth": gate.depth}
     described |= {"phase_ns": phase_ns, "spin_ns": shaping.spin_ns, "pause_ns": shaping.pause_ns}
     if gate.modes is not None and plan.modes is not None:
-        described["modes"] = {"topic": plan.modes.topic, **vars(gate.modes)}
+        described["modes"] = plan.modes.model_dump()
     with wrong_values_refused(NodeDescription, "the plan's shaping node cannot be run: "):
         callback = CallbackDescription(
             subscription=shaping.input,

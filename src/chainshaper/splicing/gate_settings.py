@@ -12,7 +12,7 @@ from typing import Any
 from chainshaper.linux.threads import gate_thread_name
 from chainshaper.planning.chain_plan import ChainPlan, ShapingNode, server_of
 from chainshaper.planning.overruns import cycles_until_output
-from chainshaper.robot.gate import DEPTH, Gate, Modes
+from chainshaper.robot.gate import DEPTH, Gate, GateModes
 from chainshaper.robot.node_parameters import gate_parameters
 from chainshaper.sources.preload import native_library
 
@@ -25,7 +25,7 @@ def gate_of(plan: ChainPlan, node: ShapingNode, depth: int = DEPTH) -> Gate:
     server = server_of(plan, node.thread)  # there is one, or the plan was refused
     modes = plan.modes if node == plan.shaping_node else None
     # Plans number bands from 1, as people do; a gate numbers its slots from 0.
-    bands = {} if modes is None else {mode: band - 1 for mode, band in modes.bands.items()}
+    slots = {} if modes is None else {mode: band - 1 for mode, band in modes.bands.items()}
     return Gate(
         slots=() if server is None else server.slots,
         cycle_ns=plan.cycle_ns,
@@ -33,7 +33,7 @@ def gate_of(plan: ChainPlan, node: ShapingNode, depth: int = DEPTH) -> Gate:
         phase_ns=plan.offset_ns,
         overrun=plan.overrun,
         due_cycles=cycles_until_output(plan, node),
-        modes=None if modes is None else Modes(bands, modes.default, modes.late),
+        modes=None if modes is None else GateModes(slots, modes.default, modes.late),
         messages=plan.messages,
         into_open_slot=plan.into_open_slot,
         depth=depth,

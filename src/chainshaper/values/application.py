@@ -6,33 +6,41 @@ from typing import Literal, TypeAlias
 from chainshaper.values.durations import format_duration
 
 INTERNAL_TOPICS = frozenset(("/parameter_events", "/rosout", "/clock", "/_chainshaper_rehearsal"))
-"""Topics that every node has for itself, or every shaping node: they connect no computation."""
+"""Topics that every node, or every shaping node, has for itself: they connect no computation."""
 
 _PARAMETERS = ("describe_parameters", "get_parameter_types", "get_parameters", "list_parameters")
 _STATES = ("change_state", "get_state", "get_available_states", "get_available_transitions")
 INTERNAL_SERVICES = frozenset((*_PARAMETERS, *_STATES)) | {
-    *("get_type_description", "set_parameters", "set_parameters_atomically", "get_transition_graph")
+    "get_type_description",
+    "set_parameters",
+    "set_parameters_atomically",
+    "get_transition_graph",
 }
 """The last parts of the names of services that every node, or lifecycle node, has for itself."""
 
 REQUEST, RESPONSE = ":request", ":response"
-"""Behind a service's name: what its clients publish, and what its server does, as if on topics."""
+"""Endings of a service's name: requests and responses are treated as messages on such topics."""
 CallbackKind: TypeAlias = Literal["timer", "subscription", "service", "client", "unknown"]
-"""``unknown``: it was seen to run, but not to be created (tracing started after it), or only its
-publications were seen (``handle`` 0: a thread of the node's own)."""
+"""What starts a callback.
+
+"unknown": its creation was not seen, since tracing started later; or only its publications were
+seen, since a thread of the node's own makes them (``handle`` is 0 then).
+"""
 
 
 def trigger_text(topic: str | None, period_ns: int | None, declared_ns: int | None = None) -> str:
-    """What starts a callback: its topic, or ``every 100ms``; else empty.
+    """Say what starts a callback: its topic, or ``every 100ms``; empty: not known.
 
-    Where a timer was declared with another period than its starts show, both are there:
+    A timer that starts with another period than the declared one has both:
     ``every 50ms (declared 100ms)``.
     """
-    return topic or "" if period_ns is None else f"every {period_text(period_ns, declared_ns)}"
+    if period_ns is None:
+        return topic or ""
+    return f"every {period_text(period_ns, declared_ns)}"
 
 
 def period_text(period_ns: int, declared_ns: int | None) -> str:
-    """The period of a timer, and the declared one where its starts show another than that."""
+    """Return a timer's period, with the declared one if that is another."""
     if declared_ns in (None, period_ns):
         return format_duration(period_ns)
     return f"{format_duration(period_ns)} (declared {format_duration(declared_ns)})"
@@ -58,26 +66,20 @@ class Node:
 
 @dataclass(frozen=True)
 class Callback:
-    """One callback of one node.
+    """A callback of a node."""
 
-    ``id`` numbers the callbacks of one graph from 0 and is the key that analysis tables use;
-    ``handle`` is its address in the traced process, which other processes may use as well.
-    ``earlier_pids`` are the processes before ``pid`` of a node that was started again.
-    ``period_ns`` is that of a timer's starts, which may be another than the declared one.
-    """
-
-    id: int
+    id: int  # its number in the graph, from 0: the key in analysis tables
     kind: CallbackKind
     node: str
     pid: int
-    handle: int
+    handle: int  # its address in the traced process; other processes may have the same
     topic: str | None = None  # subscribed topic, or the service's name
-    period_ns: int | None = None  # timers only
+    period_ns: int | None = None  # of a timer, as its starts show it
     symbol: str | None = None  # the registered function, demangled where possible
-    publishes: tuple[str, ...] = ()  # topics written by its instances (and, synchronised, for it)
+    publishes: tuple[str, ...] = ()  # topics on which it publishes, or another one for it
     passes_on: tuple[str, ...] = ()  # those of `publishes` that another callback writes for it
     in_turns: tuple[str, ...] = ()  # those that it or another writes, whichever has the last input
-    earlier_pids: tuple[int, ...] = ()
+    earlier_pids: tuple[int, ...] = ()  # processes before `pid` of a node that was started again
     declared_ns: int | None = None  # the period with which the timer was created, always the same
 
     @property
@@ -87,7 +89,7 @@ class Callback:
 
     @property
     def trigger(self) -> str | None:
-        """The topic whose messages it takes: of a service its requests, of a client responses."""
+        """The topic whose messages it takes; a service takes requests, a client responses."""
         ending = {"subscription": "", "service": REQUEST, "client": RESPONSE}.get(self.kind)
         return None if ending is None or self.topic is None else self.topic + ending
 
@@ -121,18 +123,17 @@ class ApplicationGraph:
         return tuple(sorted(self.publishers.keys() | self.subscribers.keys()))
 
     def label(self, callback: Callback) -> str:
-        """The callback's label, with its process where two nodes of its name ran at once."""
-        named = self.node_text(callback)
-        return f"{named}{callback.label.removeprefix(callback.node)}"
+        """Return the callback's label, with its process where two nodes of its name ran at once."""
+        return f"{self.node_text(callback)}{callback.label.removeprefix(callback.node)}"
 
     def node_text(self, callback: Callback) -> str:
-        """The callback's node as a way point: ``/talker``, of two at once ``/talker@4711``."""
-        namesakes = {one.pid for one in self.callbacks if one.node == callback.node}
-        namesakes |= {one.pid for one in self.nodes if one.name == callback.node}
-        return f"{callback.node}@{callback.pid}" if len(namesakes) > 1 else callback.node
+        """Return the node as a way point: ``/talker``, or ``/talker@4711`` of several at once."""
+        pids = {namesake.pid for namesake in self.callbacks if namesake.node == callback.node}
+        pids |= {namesake.pid for namesake in self.nodes if namesake.name == callback.node}
+        return f"{callback.node}@{callback.pid}" if len(pids) > 1 else callback.node
 
     def path(self, chain: "Chain") -> list[Callback]:
-        """The callbacks of a chain."""
+        """Return the callbacks of a chain."""
         by_id = {callback.id: callback for callback in self.callbacks}
         return [by_id[number] for number in chain.callbacks]
 

@@ -14,7 +14,7 @@ _DURATION = re.compile(r"\s*([+-]?\d+(?:\.\d*)?|[+-]?\.\d+)\s*(ns|us|µs|ms|s)\s
 
 
 def parse_duration(text: str) -> int:
-    """Nanoseconds of a duration with a unit: ``ns``, ``us`` (or ``µs``), ``ms`` or ``s``.
+    """Return the nanoseconds of a duration with a unit: ``ns``, ``us`` (``µs``), ``ms`` or ``s``.
 
     Exact: ``0.1ms`` is 100000, never 99999. A bare ``0`` needs no unit.
 
@@ -33,12 +33,12 @@ def parse_duration(text: str) -> int:
 
 
 def format_duration(nanoseconds: int) -> str:
-    """The shortest exact text for files and options, as `parse_duration` reads it: ``59ms``."""
+    """Return the shortest exact text for files and options, for `parse_duration`: ``59ms``."""
     return duration_text(nanoseconds).replace(" ", "")
 
 
 def duration_text(nanoseconds: int) -> str:
-    """The same in a sentence: ``59 ms``."""
+    """Return the shortest exact text for sentences: ``59 ms``."""
     for unit in ("s", "ms", "us"):
         if abs(nanoseconds) >= NS_PER_UNIT[unit]:
             value = Decimal(nanoseconds) / NS_PER_UNIT[unit]
@@ -47,5 +47,5 @@ def duration_text(nanoseconds: int) -> str:
 
 
 def milliseconds(nanoseconds: float, digits: int = 3) -> str:
-    """Milliseconds with a fixed number of digits, for tables that people compare by eye."""
+    """Return milliseconds with a fixed number of digits, for tables that people compare by eye."""
     return f"{nanoseconds / 1e6:.{digits}f}"

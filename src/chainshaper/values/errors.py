@@ -1,15 +1,15 @@
-"""What people are shown: what went wrong, with the exit code it ends in, and text of others.
+"""Errors with their exit codes, and how text of others is shown safely.
 
 Every message names the thing (file, line, topic, thread), the reason and the remedy.
 
-Characters in text of others (traces, names of hosts, topics, files) rewrite a terminal, answer in
-the user's place, turn the direction of reading around, are not seen, or end an XML file. They are
-shown as Python writes them (``\\x1b``). Whatever shows text passes it through here, all of it and
-last; JSON escapes by itself.
+Text of others (traces, names of hosts, topics, files) may have characters that rewrite a terminal,
+answer in the user's place, reverse the direction of reading, are invisible, or end an XML file.
+Such characters are shown as Python writes them (``\\x1b``). All text passes through :func:`shown`
+or :func:`escape` as the last step before people see it; JSON escapes by itself.
 
 Names that the kernel gives (of programs, files, mount points, cgroups, arguments) are bytes, and
-need not be UTF-8. What is opened again keeps them exactly (`os.fsdecode`); what is only shown or
-stored is :func:`text_of` them, which is Unicode always.
+need not be UTF-8. Names by which something is opened again are kept exactly (`os.fsdecode`); those
+that are only shown or stored go through :func:`text_of`, so that they are Unicode.
 """
 
 import html
@@ -19,7 +19,7 @@ from typing import Any
 
 
 class ChainshaperError(Exception):
-    """Any failure that chainshaper foresaw; its message is complete for a person."""
+    """A failure that chainshaper expects to happen; its message says all that a person needs."""
 
     exit_code = 1
 
@@ -41,17 +41,18 @@ class PlatformError(ChainshaperError):
 
 
 def extra_library(name: str, purpose: str, extra: str | None = None) -> Any:
-    """Import a library, or one module of it, that only some uses need and an ``extra`` installs.
+    """Import a library, or a module of it, that only some uses need.
 
-    Raises PlatformError: it is not installed; says what it is needed for and how to get it.
+    ``extra`` is the extra of chainshaper that installs it; None: none does. Raises PlatformError:
+    it is not installed, with the ``purpose`` that needs it and how to get it.
     """
     try:
         return importlib.import_module(name)
     except ImportError as error:
         package = name.partition(".")[0]
         wanted = package if extra is None else f"'chainshaper[{extra}]'"
-        what = f"{purpose} needs the Python package {package} ({error})"
-        raise PlatformError(f"{what}: install it with `pip install {wanted}`") from error
+        lacks = f"{purpose} needs the Python package {package} ({error})"
+        raise PlatformError(f"{lacks}: install it with `pip install {wanted}`") from error
 
 
 _UNSAFE = re.compile(
@@ -67,26 +68,28 @@ _NO_CHARACTER = re.compile("[\ud800-\udfff]")
 
 
 def shown(text: str, but: str = "") -> str:
-    """The text with every character escaped that does more than be seen, ``but`` these."""
-    return _UNSAFE.sub(lambda found: found[0] if found[0] in but else _escaped(found[0]), text)
+    """Escape every character that does more than be seen, ``but`` these."""
+    return _UNSAFE.sub(lambda match: match[0] if match[0] in but else _escaped(match[0]), text)
 
 
 def _escaped(character: str) -> str:
+    """Return a character as Python writes it; a byte that is no UTF-8 as ``\\xfc``."""
     byte = ord(character) - 0xDC00  # as `os.fsdecode` keeps a byte that is no UTF-8
     return f"\\x{byte:02x}" if 0x80 <= byte <= 0xFF else ascii(character)[1:-1]
 
 
 def text_of(content: bytes) -> str:
-    """Bytes of others as text, to be shown or stored: what is no UTF-8 is escaped (``\\xfc``)."""
+    """Make text of bytes, to be shown or stored; what is no UTF-8 is escaped (``\\xfc``)."""
     return content.decode(errors="backslashreplace")
 
 
 def storable(value: Any) -> Any:
-    """Plain data with every text escaped that no file in UTF-8 can hold, as :func:`text_of` has it:
-    arguments and paths that `os.fsdecode` made, names in JSON of others.
+    """Escape in plain data, as :func:`text_of` does, what no file in UTF-8 can hold.
+
+    That may be in arguments and paths that `os.fsdecode` made, and in JSON of others.
     """
     if isinstance(value, str):
-        return _NO_CHARACTER.sub(lambda found: _escaped(found[0]), value)
+        return _NO_CHARACTER.sub(lambda match: _escaped(match[0]), value)
     if isinstance(value, dict):
         return {storable(key): storable(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
@@ -95,5 +98,5 @@ def storable(value: Any) -> Any:
 
 
 def escape(text: str) -> str:
-    """The same for HTML and SVG, in elements and attributes; lines stay lines."""
+    """Escape text for elements and attributes of HTML and SVG; line feeds stay."""
     return html.escape(shown(text, but="\n"))

@@ -82,13 +82,13 @@ class Event:
     fields_before_8: tuple[EventField, ...] | None = None
 
     def fields_of_version(self, tracetools_major: int) -> tuple[EventField, ...]:
-        """The fields as this major version of tracetools passes them."""
+        """Return the fields that this major version of tracetools passes as arguments."""
         if tracetools_major < 8 and self.fields_before_8 is not None:
             return self.fields_before_8
         return self.fields
 
     def place_in_record(self, field: EventField) -> int | None:
-        """Which of a record's values a field is in the tracing library's memory; None: in none."""
+        """Return the place of a field in a record of the library's memory; None: it has none."""
         if self.recorded_by_library == "service call" or field.argument is None:
             return field.record_place
         return field.argument
@@ -573,9 +573,9 @@ _OURS = (
             EventField("callback", "address"),  # that the message came to
             EventField("source_timestamp", "nanoseconds"),  # of the message; CLOCK_REALTIME
             EventField("arrival", "nanoseconds"),  # when the message came
-            EventField("origin", "nanoseconds"),  # that slots count from: the cycle's beginning
+            EventField("origin", "nanoseconds"),  # the cycle's beginning, from which slots count
             EventField("release", "nanoseconds"),  # when it was to leave; null: never
-            EventField("slot", "small number"),  # it left in, from 0; null: in none
+            EventField("slot", "small number"),  # in which it left, from 0; null: in none
             EventField("cycles_waited", "small number"),  # 0: it left in its own cycle
             EventField("anchor", "text"),  # of `origin`: "stamp", or "cycle" (no usable stamp too)
             # What the gate did about a message that was too late: "wait", "discard", "publish", or
@@ -589,8 +589,8 @@ _OURS = (
             # Null: it left.
             EventField("dropped", "text", presence="optional"),
             EventField("published", "nanoseconds", presence="optional"),  # publishing returned
-            # For how long behind the release neither the gate nor any other thread ran on its core:
-            # what the machine itself took.
+            # For how long after the release neither the gate nor any other thread ran on its core,
+            # since the machine itself stood still.
             EventField("stalled", "nanoseconds", presence="optional"),
             # How many messages DDS lost between the one before and this one; null: not known.
             EventField("lost", "number", presence="optional"),
@@ -603,8 +603,8 @@ _OURS = (
             EventField("gate", "text", presence="optional"),
         ),
     ),
-    # The thread of an asynchronous publisher was done with a message. `time` is when it took the
-    # message.
+    # The thread of an asynchronous publisher was done with a message. `time` is when it had taken
+    # the message.
     Event(
         "asynchronous_send",
         "messages",
@@ -648,14 +648,14 @@ EVENTS: dict[str, Event] = {
 
 
 def events_in_group(group: EventGroup) -> frozenset[str]:
-    """The names of a group's events."""
+    """Return the names of a group's events."""
     return frozenset(event.name for event in EVENTS.values() if event.group == group)
 
 
 def events_of_library(declared: Iterable[Event] | None = None) -> tuple[Event, ...]:
-    """The events that the tracing library in front of ROS 2 records, in the order of their numbers.
+    """Return the events that the tracing library in front of ROS 2 records, by their numbers.
 
-    ``declared`` is for tests; by default these are chosen from all events.
+    They are chosen from the ``declared`` events, which tests give; by default from all.
     """
     chosen = EVENTS.values() if declared is None else declared
     return tuple(event for event in chosen if event.recorded_by_library != "no")

@@ -1,17 +1,15 @@
-"""The event tables: one frame for each event, with the same columns whoever traced it.
+"""The event tables: a frame for each event, with the same columns whichever tracer recorded it.
 
 :mod:`.event_declarations` says which events there are, with which fields. Each table begins with
 
-* ``time``: ns of CLOCK_MONOTONIC (the recording's ``clock_offset_ns`` added, it is wall-clock time,
-  as DDS source timestamps are),
-* ``pid``, ``tid``: process and thread, as the kernel numbers them in the traced container,
-* ``cpu``: the core, null where the source does not know it,
+* ``time``: ns of CLOCK_MONOTONIC. The sum with the recording's ``clock_offset_ns`` is wall-clock
+  time, as DDS source timestamps are;
+* ``pid``, ``tid``: process and thread, as the kernel numbers them in the traced container;
+* ``cpu``: the core, null where the source does not know it.
 
-and goes on with the event's fields.
-
-Handles (``*_handle``, ``callback``, ``message``, ``subscription``) are addresses: unique only
-within one process and only until they are freed. Tables lack columns that their source cannot
-know; a table that is missing altogether is the same as an empty one.
+The event's fields follow. Handles (``*_handle``, ``callback``, ``message``, ``subscription``) are
+addresses: unique only within a process, and only until the object is freed. Columns that a source
+cannot know are missing in its tables. A missing table is the same as an empty one.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -45,7 +43,7 @@ _TYPES: dict[FieldKind, pl.DataType] = {
 
 
 def type_of(field: EventField) -> pl.DataType:
-    """The type of a field's column."""
+    """Return the type of a field's column."""
     return _TYPES[field.kind]
 
 
@@ -79,25 +77,37 @@ NODE_NAME = pl.col("namespace").fill_null("").str.strip_chars_end("/") + "/" + p
 
 
 def happened(tables: EventTables, since_ns: int, until_ns: int | None = None) -> EventTables:
-    """The events of a time, those of gates by when the cycle began; and all objects' creation."""
-    found = dict(tables)
+    """Return the events of a span of time, and the creation of all objects.
+
+    An event of a gate counts from when its cycle began.
+    """
+    chosen = dict(tables)
     for name, frame in tables.items():
         if name not in CREATION:
-            begun = pl.min_horizontal("time", *{"origin"}.intersection(frame.columns))
-            ended = pl.lit(False) if until_ns is None else pl.col("time") >= until_ns
-            found[name] = frame.filter((begun >= since_ns) & ~ended)
-    return found
+            begins = [column for column in ("time", "origin") if column in frame.columns]
+            is_inside = pl.min_horizontal(begins) >= since_ns
+            if until_ns is not None:
+                is_inside &= pl.col("time") < until_ns
+            chosen[name] = frame.filter(is_inside)
+    return chosen
 
 
 def empty(name: str) -> pl.DataFrame:
-    """An empty table with all columns of event ``name``."""
+    """Return an empty table with all columns of event ``name``."""
     return pl.DataFrame(schema={**COMMON_COLUMNS, **FIELDS[name]})
 
 
 def table(tables: EventTables, name: str, columns: Iterable[str] = ()) -> pl.DataFrame:
-    """The table of event ``name``, empty when absent, with ``columns``, null if unknown."""
-    frame, known = tables[name] if name in tables else empty(name), column_types(name)
-    nulls = [pl.lit(None, known[one]).alias(one) for one in columns if one not in frame.columns]
+    """Return the table of event ``name``, empty if absent, with these ``columns``.
+
+    A column that the table lacks is null.
+    """
+    frame, types = tables[name] if name in tables else empty(name), column_types(name)
+    nulls = [
+        pl.lit(None, types[column]).alias(column)
+        for column in columns
+        if column not in frame.columns
+    ]
     return frame.with_columns(nulls) if nulls else frame
 
 
@@ -110,13 +120,17 @@ class ReadAgain(Protocol):
 
 
 def column_types(name: str) -> dict[str, pl.DataType]:
-    """Every column that a table of event ``name`` may have; of others only the common ones."""
-    own = {**FIELDS.get(name, {}), **OPTIONAL_FIELDS.get(name, {})}
-    return {**COMMON_COLUMNS, **own} if name in FIELDS else {"time": COMMON_COLUMNS["time"]}
+    """Return the types of all columns that a table of event ``name`` may have.
+
+    Of an event that is not declared, it is the time only.
+    """
+    if name not in FIELDS:
+        return {"time": COMMON_COLUMNS["time"]}
+    return {**COMMON_COLUMNS, **FIELDS[name], **OPTIONAL_FIELDS.get(name, {})}
 
 
 def column_problems(schema: Mapping[str, pl.DataType], name: str) -> list[str]:
-    """What is wrong with the columns of a table of event ``name``, in words."""
+    """Say what is wrong with the columns of a table of event ``name``."""
     types = column_types(name)
     optional = {"cpu", *OPTIONAL_FIELDS.get(name, ()), *VERSION_FIELDS.get(name, ())}
     problems = [
@@ -132,18 +146,19 @@ def column_problems(schema: Mapping[str, pl.DataType], name: str) -> list[str]:
     return problems
 
 
-def castable(found: pl.DataType | None, wanted: pl.DataType) -> bool:
-    """Whether values can become those of a column: integers of another width can."""
+def castable(type_: pl.DataType | None, wanted: pl.DataType) -> bool:
+    """Whether values of a type can be cast to a column's: integers of another width can."""
     if isinstance(wanted, pl.List):
-        return isinstance(found, pl.List | pl.Array) and found.inner.is_integer()
-    if wanted.is_integer() and found is not None:
-        return found.is_integer() or isinstance(found, pl.Null)
-    return isinstance(found, pl.String | pl.Categorical | pl.Null)
+        return isinstance(type_, pl.List | pl.Array) and type_.inner.is_integer()
+    if wanted.is_integer() and type_ is not None:
+        return type_.is_integer() or isinstance(type_, pl.Null)
+    return isinstance(type_, pl.String | pl.Categorical | pl.Null)
 
 
 def as_table(frame: pl.DataFrame, name: str) -> pl.DataFrame:
-    """A frame with the types of its event's table. Raises PolarsError: a value does not fit, or a
-    row has no time.
+    """Cast a frame to the types of its event's table.
+
+    Raises PolarsError: a value does not fit, or a row has no time.
     """
     if "cpu" not in frame.columns:
         frame = frame.with_columns(cpu=pl.lit(None, COMMON_COLUMNS["cpu"]))

@@ -1,12 +1,12 @@
-"""Files that may run here, and files that are written whole, and never over another.
+"""Check which files may be run, and write files whole, and never over another.
 
-Only files that root and the user of this process alone can change may run, as ssh asks of its keys.
-A folder above may be writable by others where its sticky bit prevents them from replacing what is
-in it, as in /tmp.
+A file may be run only if nobody but root and the user of this process can change it, as ssh asks of
+its keys. A folder above it may be writable by others if its sticky bit prevents them from replacing
+what is in it, as in /tmp.
 
-What we write may be asked for in a folder of another user (`sudo chainshaper record`), who may put
-a link where a file of ours will be, or a folder of ours was. So all that is written is opened here:
-links of other users are not followed, and nothing is written into that was there and is not ours.
+Output may be asked for in a folder of another user (`sudo chainshaper record`). That user may put a
+link where a file of ours will be, or where a folder of ours was. So all output is opened here:
+links of other users are not followed, and nothing is written into a file that is not ours.
 """
 
 import errno
@@ -25,30 +25,33 @@ from chainshaper.values.leftovers import claim, claimed, clear_leftovers
 
 
 def why_distrusted(path: str | Path) -> str | None:
-    """Why others may change a file, a folder or what leads there; None if they cannot."""
-    place = Path(os.path.realpath(path))
-    for part in (place, *place.parents):
+    """Say why others may change a file or folder, or what leads there; None: they cannot."""
+    real = Path(os.path.realpath(path))
+    for part in (real, *real.parents):
         try:
             state = part.lstat()
         except OSError as error:
             return f"{part}: {error.strerror}"
         if state.st_uid not in (0, os.geteuid()):
             return f"{part} belongs to {_user(state.st_uid)}"
-        if part != place and state.st_mode & stat.S_ISVTX:
+        if part != real and state.st_mode & stat.S_ISVTX:
             continue
-        of_group = state.st_mode & stat.S_IWGRP and not _is_own_group(state.st_gid, state.st_uid)
-        if of_group or state.st_mode & stat.S_IWOTH:
+        group_writes = (state.st_mode & stat.S_IWGRP) != 0
+        if group_writes and _is_private_group(state.st_gid, state.st_uid):
+            group_writes = False
+        if group_writes or state.st_mode & stat.S_IWOTH:
             return f"{part} is writable by others than {_user(state.st_uid)}"
     return None
 
 
 def own_cache() -> Path:
-    """Our folder in the user's cache, which need not be there; links to it are followed.
+    """Return chainshaper's folder in the user's cache, which need not exist; links are followed.
 
-    Where the cache that the environment names is another user's (`sudo -E`), it is our own.
+    Where others may change the cache that the environment names (`sudo -E`), it is in the home of
+    our own user.
     """
     cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    if not cache.is_absolute():  # and is to be ignored, as its specification has it
+    if not cache.is_absolute():  # to be ignored, as its specification says
         cache = Path(os.path.expanduser("~/.cache"))  # noqa: PTH111 - the other raises without one
     existing = next(place for place in (cache, *cache.parents) if os.path.exists(place))  # noqa: PTH110
     if why_distrusted(existing) is not None:
@@ -64,24 +67,25 @@ def _user(uid: int) -> str:
         return f"user {uid}"
 
 
-def _is_own_group(gid: int, uid: int) -> bool:
-    """Whether a group is its user's own and has no other member, as Debian makes one for each."""
+def _is_private_group(gid: int, uid: int) -> bool:
+    """Whether a group has a user as its only member, such as Debian makes for each user."""
     try:
         user, group = pwd.getpwuid(uid), grp.getgrgid(gid)
     except KeyError:
         return False
-    own = user.pw_gid == gid and group.gr_name == user.pw_name
-    return own and {*group.gr_mem} <= {user.pw_name}
+    if user.pw_gid != gid or group.gr_name != user.pw_name:
+        return False
+    return set(group.gr_mem) <= {user.pw_name}
 
 
-_LONGEST_FILE = 512 << 20
+_LONGEST_FILE = 512 << 20  # bytes
 SCRATCH = "chainshaper"
-"""What :func:`scratch_folder` makes folders for: it names them."""
+"""The name from which the names of :func:`scratch_folder` are made."""
 _FOLDER = os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 def open_regular(path: Path) -> int:
-    """Open a file that a process of others has named. Raises OSError: no ordinary one."""
+    """Open a file that another user's process has named. Raises OSError: it is no ordinary file."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
@@ -90,7 +94,10 @@ def open_regular(path: Path) -> int:
 
 
 def read_regular(path: Path, longest: int = _LONGEST_FILE) -> bytes:
-    """The content of such a file. Raises OSError: also if it is longer."""
+    """Read a file that another user's process has named.
+
+    Raises OSError: it is no ordinary file, or longer than ``longest`` bytes.
+    """
     with os.fdopen(open_regular(path), "rb") as file:
         content = file.read(longest + 1)
     if len(content) > longest:
@@ -102,8 +109,9 @@ _MOST_LINKS = 40  # as many as the kernel follows
 
 
 def open_folder(folder: Path) -> int:
-    """Open a folder that something is to be written into; only links of root and of our user lead
-    there. Raises InputError: another user's does. OSError: there is no such folder.
+    """Open a folder that something is to be written into, following links of root and our user.
+
+    Raises InputError: a link of another user leads there. OSError: there is no such folder.
     """
     links, parts = 0, [*reversed(folder.absolute().parts)]
     opened = [os.open(parts.pop(), _FOLDER)]
@@ -124,7 +132,7 @@ def open_folder(folder: Path) -> int:
                 raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
             target = Path(os.readlink("", dir_fd=opened[-1]))
             opened.append(os.open("/", _FOLDER) if target.is_absolute() else os.dup(opened[-2]))
-            parts += reversed([one for one in target.parts if one != "/"])
+            parts += reversed([name for name in target.parts if name != "/"])
         return os.open(".", _FOLDER, dir_fd=opened[-1])
     finally:
         for descriptor in opened:
@@ -132,10 +140,10 @@ def open_folder(folder: Path) -> int:
 
 
 def open_output(path: Path, flags: int = os.O_WRONLY | os.O_EXCL, mode: int = 0o666) -> int:
-    """Open a file to write into, a new one unless the ``flags`` of `open` say otherwise.
+    """Open a file to write into; it must be new, unless the ``flags`` of `open` say otherwise.
 
-    Raises InputError: what is there is a link, no ordinary file, or not ours alone, and nothing of
-    it is touched; or as :func:`open_folder`. OSError: as `open`.
+    Raises InputError: what is there is a link, no ordinary file, or not ours alone; it is left as
+    it was. Or as :func:`open_folder`. OSError: as `open`.
     """
     folder = open_folder(path.absolute().parent)
     flags |= os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
@@ -165,9 +173,10 @@ def open_output(path: Path, flags: int = os.O_WRONLY | os.O_EXCL, mode: int = 0o
 
 
 def free_place(path: Path, taken: bool) -> Path:
-    """The path, if it is not ``taken`` and its folder is there; asked before long work begins.
+    """Return the path if something new can be made there; to be asked before long work begins.
 
-    Raises InputError: it is taken, its folder does not exist, or another user's link leads there.
+    Raises InputError: it is ``taken``, its folder does not exist, or another user's link leads
+    there.
     """
     if taken or path.is_symlink():
         raise InputError(
@@ -181,9 +190,10 @@ def free_place(path: Path, taken: bool) -> Path:
 
 
 def new_file(path: str | Path, endings: tuple[str, ...] = ()) -> Path:
-    """The path, once it is sure that a file of this kind can be made there.
+    """Return the path if a new file of this kind can be made there.
 
-    Raises InputError: as :func:`free_place`, or it ends in none of ``endings``, if there are any.
+    Raises InputError: as :func:`free_place`; or it ends in none of ``endings`` (none: all are
+    right).
     """
     path = Path(path)
     if endings and path.suffix not in endings:
@@ -192,7 +202,7 @@ def new_file(path: str | Path, endings: tuple[str, ...] = ()) -> Path:
 
 
 def write_whole(path: Path, parts: Iterable[bytes]) -> Path:
-    """Write beside the final place, then rename.
+    """Write a file beside its final place, then rename it.
 
     Raises OperationError: it cannot be written; nothing is left behind. InputError: as
     :func:`open_folder`.
@@ -200,10 +210,10 @@ def write_whole(path: Path, parts: Iterable[bytes]) -> Path:
     name = f".{path.name}.partial-{secrets.token_hex(4)}"
     folder: int | None = None
     try:
-        folder = open_folder(path.absolute().parent)  # it stays the same, whatever is renamed
+        folder = open_folder(path.absolute().parent)  # open, so that nobody can exchange it
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
         with os.fdopen(os.open(name, flags, 0o600, dir_fd=folder), "wb") as stream:
-            claim(stream.fileno())  # until it has its name
+            claim(stream.fileno())  # see `leftovers`
             stream.writelines(parts)
             stream.flush()
             os.fsync(stream.fileno())
@@ -224,7 +234,7 @@ def write_whole(path: Path, parts: Iterable[bytes]) -> Path:
 
 @contextmanager
 def folder_beside(path: Path) -> Iterator[str]:
-    """A new folder to fill, and to rename to ``path``; if it is not, it is gone at the end."""
+    """Make a folder to be filled and renamed to ``path``; if it is not renamed, it is removed."""
     name, parent = f".{path.name}.partial-", path.absolute().parent
     new = tempfile.TemporaryDirectory(prefix=name, dir=parent, ignore_cleanup_errors=True)
     with new as made, claimed(Path(made)):
@@ -233,30 +243,36 @@ def folder_beside(path: Path) -> Iterator[str]:
 
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """A new folder for a while, among the machine's temporary ones; what a killed run has left of
-    its own there, the next one removes, and `chainshaper release`.
+    """Make a folder for the context, among the machine's temporary ones.
+
+    What killed runs have left there is removed first; `chainshaper release` removes it, too.
     """
-    place = Path(tempfile.gettempdir()).absolute()
-    clear_leftovers(place, SCRATCH)
-    with folder_beside(place / SCRATCH) as made:
+    temporary = Path(tempfile.gettempdir()).absolute()
+    clear_leftovers(temporary, SCRATCH)
+    with folder_beside(temporary / SCRATCH) as made:
         yield Path(made)
 
 
 def clear_killed_runs(folder: Path) -> tuple[list[str], list[str]]:
-    """Remove what killed runs have left in a folder, among temporary files and in our cache, as
-    :func:`.clear_leftovers`.
+    """Remove what killed runs have left in a folder, among temporary files and in our cache.
+
+    Returns what :func:`.clear_leftovers` does.
     """
     removed, stays = clear_leftovers(folder)
-    for place, name in ((Path(tempfile.gettempdir()).absolute(), SCRATCH), (own_cache(), None)):
-        if place.is_dir() and not place.samefile(folder):
-            more, still = clear_leftovers(place, name)
-            removed += more
-            stays += still
+    temporary = Path(tempfile.gettempdir()).absolute()
+    for elsewhere, output in ((temporary, SCRATCH), (own_cache(), None)):
+        if elsewhere.is_dir() and not elsewhere.samefile(folder):
+            removed_there, stays_there = clear_leftovers(elsewhere, output)
+            removed += removed_there
+            stays += stays_there
     return removed, stays
 
 
 def rename_output(made: Path, path: Path) -> Path:
-    """Put what we have made where it is to be. Raises: as :func:`open_folder`; OSError."""
+    """Move what we have made to its final place.
+
+    Raises InputError: as :func:`open_folder`. OSError: as `os.rename`.
+    """
     before, folder = open_folder(made.parent), open_folder(path.absolute().parent)
     try:
         os.rename(made.name, path.name, src_dir_fd=before, dst_dir_fd=folder)
@@ -267,9 +283,9 @@ def rename_output(made: Path, path: Path) -> Path:
 
 
 def open_to_all(folder: Path) -> None:
-    """Let everybody read a folder that we have made; never what a link in its place leads to.
+    """Let everybody read a folder that we have made.
 
-    Raises OSError: it is no folder any more.
+    Raises OSError: it is no folder any more, such as a link that somebody has put in its place.
     """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:

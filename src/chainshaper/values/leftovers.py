@@ -1,8 +1,8 @@
-"""What a killed run has left beside its output: ``.NAME.partial-…``, ``.NAME.tracing-…``,
-``.NAME.older-…``, each a folder or a file.
+"""Find and remove what killed runs have left beside their output.
 
-Who fills one holds a lock of it, which the kernel takes back with the process: whatever is locked
-belongs to a run that goes on, whoever started it and under whatever number.
+That is folders and files called ``.NAME.partial-…``, ``.NAME.tracing-…`` or ``.NAME.older-…``. The
+process that fills one has it locked, and the kernel takes the lock back when the process ends. So
+whatever is locked belongs to a run that goes on, and all else is left over.
 """
 
 import fcntl
@@ -17,24 +17,25 @@ from pathlib import Path
 
 _HIDDEN = re.compile(r"\.(?P<name>.+)\.(?P<kind>partial|tracing|older)-\w+", re.DOTALL)
 _FILE = re.compile(r".+-[0-9a-f]{8}", re.DOTALL)
-"""How names of such files end; a name that is less like ours may be of a file that is not."""
+"""Names of files that chainshaper makes end like this; other files may be somebody else's."""
 _YOUNG_S = 10
-"""Younger than this, it may be without its lock since it has just been made."""
+"""What is younger may have just been made, and not be locked yet."""
 _ENTRY = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
 _FOLDER = _ENTRY | os.O_DIRECTORY
 
 
 def claim(descriptor: int) -> None:
-    """Lock an open file or folder of ours until it is closed, where its file system has locks."""
+    """Lock an open file or folder until it is closed, if its file system has locks."""
     with suppress(OSError):
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[Path]:
-    """A folder that is ours inside. Where the file system has no locks, it counts as live for ever.
+    """Lock a folder for the context.
 
-    Raises OSError: it is no folder any more.
+    Where the file system has no locks, nothing ever counts as left over. Raises OSError: it is no
+    folder any more.
     """
     descriptor = os.open(folder, _FOLDER)
     try:
@@ -45,29 +46,31 @@ def claimed(folder: Path) -> Iterator[Path]:
 
 
 def leftovers(folder: Path, output: str | None = None) -> list[Path]:
-    """What our user's killed runs have left in a folder, of one ``output`` or of all."""
+    """Return what killed runs of our user have left in a folder, of an ``output`` or of all."""
     left: list[Path] = []
     with suppress(OSError):
         for path in sorted(folder.iterdir()):
-            found = _HIDDEN.fullmatch(path.name)
-            if found is not None and output in (None, found["name"]) and _abandoned(path):
+            match = _HIDDEN.fullmatch(path.name)
+            if match is not None and output in (None, match["name"]) and _abandoned(path):
                 left.append(path)
     return left
 
 
 def _abandoned(path: Path) -> bool:
+    """Whether a file or folder is our user's, not young, and locked by no process."""
     try:
         descriptor = os.open(path, _ENTRY)
     except OSError:
         return False
     try:
         state = os.fstat(descriptor)
-        plain = stat.S_ISREG(state.st_mode) and _FILE.fullmatch(path.name) is not None
-        ours = state.st_uid == os.geteuid() and (plain or stat.S_ISDIR(state.st_mode))
-        if not ours or time.time() - state.st_mtime < _YOUNG_S:
+        is_file = stat.S_ISREG(state.st_mode) and _FILE.fullmatch(path.name) is not None
+        if state.st_uid != os.geteuid() or not (is_file or stat.S_ISDIR(state.st_mode)):
+            return False
+        if time.time() - state.st_mtime < _YOUNG_S:
             return False
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:  # somebody has the lock, or there are none
+    except OSError:  # a process has it locked, or its file system has no locks
         return False
     else:
         return True
@@ -76,13 +79,13 @@ def _abandoned(path: Path) -> bool:
 
 
 def is_trace(path: Path) -> bool:
-    """Whether a leftover is what a tracer wrote, which can often be read, and not a copy of it."""
-    found = _HIDDEN.fullmatch(path.name)
-    return found is not None and found["kind"] == "tracing"
+    """Whether a leftover was written by a tracer: it can often be read, and is the only copy."""
+    match = _HIDDEN.fullmatch(path.name)
+    return match is not None and match["kind"] == "tracing"
 
 
 def leftover_text(path: Path) -> str:
-    """What is left where, and what to do about it."""
+    """Say what is left over, and what to do about it."""
     said = f"{path} was left by a run that was killed: "
     if is_trace(path):
         return f"{said}see whether `chainshaper info` reads it, or remove it"
@@ -90,10 +93,9 @@ def leftover_text(path: Path) -> str:
 
 
 def clear_leftovers(folder: Path, output: str | None = None) -> tuple[list[str], list[str]]:
-    """Remove what killed runs have left in a folder, of one ``output`` or of all, but for traces:
-    what was removed, what stays.
+    """Remove what killed runs have left in a folder, of an ``output`` or of all; traces stay.
 
-    Each is a line for people.
+    Returns what was removed and what stays, each as lines for people.
     """
     removed, stays = list[str](), list[str]()
     for path in leftovers(folder, output):

@@ -1,6 +1,6 @@
-"""Who computes what there is much of: threads of this process, or a Dask cluster.
+"""Run many tasks on threads of this process, or on a Dask cluster.
 
-Threads suffice on one machine: decoding, Polars and the compiled engine run without the
+Threads suffice on a single machine: decoding, Polars and the simulator run without the
 interpreter's lock. And they open no port that other users could reach.
 """
 
@@ -21,25 +21,29 @@ from typing import Any, TypeVar
 
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError, extra_library
 
-CONNECT_S = 10
-WITHOUT_WORKERS_S = 60
-LOOK_S = 0.5
-ANSWER_S = 5
-CLOSE_S = 3
+CONNECT_S = 10  # how long a scheduler may take to answer at first
+WITHOUT_WORKERS_S = 60  # how long a cluster may be without workers, or not answer
+LOOK_S = 0.5  # between two looks for workers
+ANSWER_S = 5  # how long a scheduler may take to say how many workers it has
+CLOSE_S = 3  # how long closing may take
 ASKED_OF_CLUSTER = 10_000
-"""So many points at a time are with a cluster: more than its workers compute at once."""
+"""So many tasks at a time are with a cluster: more than its workers compute at once."""
 SAME = ("chainshaper", "numpy", "distributed")
 """Packages whose versions results depend on: NumPy's generators may draw differently."""
 _ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?[^/]+:\d+")
 
-One = TypeVar("One")
-Other = TypeVar("Other")
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
 class Engine:
-    """Who computes: ``submit`` (a function and its arguments, futures among them), the next future
-    that is ``finished`` and its result, and how many may be ``under_way``."""
+    """Runs tasks somewhere.
+
+    * ``submit``: takes a function and its arguments, futures among them; returns a future.
+    * ``finished``: waits for the next future that is finished; returns it and its result.
+    * ``under_way``: how many tasks should be submitted and not finished.
+    """
 
     submit: Callable[..., Any]
     finished: Callable[[], tuple[Any, Any]]
@@ -49,41 +53,46 @@ class Engine:
 def engine(
     workers: int, scheduler: str | None, purpose: str, stays: str = ""
 ) -> AbstractContextManager[Engine]:
-    """So many threads, or the cluster of a Dask ``scheduler``; a thread's function also gets
-    ``progress``, to be called now and then. For messages: ``purpose``, and what ``stays`` where the
-    cluster fails. Raises InputError: that is no address. PlatformError: `distributed` is not
-    installed. OperationError: the cluster fails, or has other versions of what results depend on.
+    """Return an engine of ``workers`` threads or, given a ``scheduler``, of its Dask cluster.
+
+    On threads, functions get an argument ``progress``, which they should call now and then. In
+    messages, ``purpose`` says what is computed, and ``stays`` what is kept if the cluster fails.
+
+    Raises InputError: ``scheduler`` is no address. PlatformError: `distributed` is not installed.
+    OperationError: the cluster fails, or has other versions of the packages in :data:`SAME`.
     """
     return _threads(workers) if scheduler is None else _cluster(scheduler, purpose, stays)
 
 
 def computed(
-    function: Callable[..., Other],
-    items: Sequence[One],
+    function: Callable[..., Result],
+    items: Sequence[Item],
     *more: Any,
     scheduler: str | None = None,
     purpose: str,
     progress: Callable[[float, str], None] = lambda *_: None,
-) -> list[Other]:
-    """``function`` of each item, and of ``more``, in the items' order; as many at a time as there
-    are cores, or as a cluster has (:func:`engine`)."""
-    found: dict[int, Other] = {}
+) -> list[Result]:
+    """Return the results of ``function(item, *more)`` for all items, in their order.
+
+    As many are computed at a time as there are cores, or as a cluster takes (:func:`engine`).
+    """
+    results: dict[int, Result] = {}
     coming, pending = iter(enumerate(items)), dict[Any, int]()
-    with engine(
-        min(len(items), len(os.sched_getaffinity(0))) or 1, scheduler, purpose
-    ) as computing:
-        while len(found) < len(items):
-            while len(pending) < computing.under_way and (one := next(coming, None)):
-                pending[computing.submit(function, one[1], *more)] = one[0]
+    workers = min(len(items), len(os.sched_getaffinity(0))) or 1
+    with engine(workers, scheduler, purpose) as computing:
+        while len(results) < len(items):
+            while len(pending) < computing.under_way and (numbered := next(coming, None)):
+                number, item = numbered
+                pending[computing.submit(function, item, *more)] = number
             future, result = computing.finished()
-            found[pending.pop(future)] = result
-            progress(len(found) / len(items), f"{len(found)} of {len(items)} recordings")
-    return [found[number] for number in range(len(items))]
+            results[pending.pop(future)] = result
+            progress(len(results) / len(items), f"{len(results)} of {len(items)} recordings")
+    return [results[number] for number in range(len(items))]
 
 
 @contextmanager
 def _threads(workers: int) -> Iterator[Engine]:
-    """Threads of this process, which leave their tasks unfinished when the work ends early."""
+    """Run tasks on threads of this process; tasks are left unfinished if the context ends early."""
     ending, done = Event(), SimpleQueue["Future[Any]"]()
 
     def go_on(*_: object) -> None:
@@ -91,8 +100,11 @@ def _threads(workers: int) -> Iterator[Engine]:
             raise CancelledError
 
     def submit(function: Callable[..., Any], *arguments: Any) -> "Future[Any]":
-        known = [one.result() if isinstance(one, Future) else one for one in arguments]
-        future = pool.submit(function, *known, progress=go_on)
+        values = [
+            argument.result() if isinstance(argument, Future) else argument
+            for argument in arguments
+        ]
+        future = pool.submit(function, *values, progress=go_on)
         future.add_done_callback(done.put)
         return future
 
@@ -110,18 +122,21 @@ def _threads(workers: int) -> Iterator[Engine]:
 
 @contextmanager
 def _cluster(address: str, purpose: str, stays: str) -> Iterator[Engine]:
-    """A Dask cluster; all of Dask's many errors leave the user with the same things to look at."""
+    """Run tasks on a Dask cluster.
+
+    Whichever of Dask's many errors occurs, the message names the same things to look at.
+    """
     distributed, here = extra_library("distributed", f"{purpose} on a Dask cluster"), _versions()
     if not _ADDRESS.fullmatch(address):
         raise InputError(f"{address!r} is no scheduler's address: write one like tcp://HOST:8786")
     try:
         connected = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
-    except (OSError, asyncio.TimeoutError) as error:  # from Python 3.11 on they are one
+    except (OSError, asyncio.TimeoutError) as error:  # the same from Python 3.11 on
         raise OperationError(
             f"no Dask scheduler answers at {address} ({error}): start one with `dask scheduler`,"
             " and give the address that it prints"
         ) from error
-    # Dask logs a traceback for each connection that breaks; what that means is said below.
+    # Dask logs a traceback for each connection that breaks; our message says what it means.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with _closed_in_time(connected) as client:
         completed = distributed.as_completed(loop=client.loop)
@@ -132,8 +147,10 @@ def _cluster(address: str, purpose: str, stays: str) -> Iterator[Engine]:
             return future
 
         def finished() -> tuple[Any, Any]:
-            """The next result. Workers may come and go, but one has to be there now and then; one
-            that has a result may hang before it has sent it.
+            """Wait for the next result.
+
+            Workers may come and go, but there has to be one now and then. A worker that has a
+            result may hang before it has sent it.
             """
             seen = looked = time.monotonic()
             while not completed.has_ready():
@@ -161,7 +178,7 @@ def _cluster(address: str, purpose: str, stays: str) -> Iterator[Engine]:
 
 @contextmanager
 def _closed_in_time(client: Any) -> Iterator[Any]:
-    """A client of a cluster that may not answer any more when it is closed."""
+    """Close a client at the end of the context, even if its cluster does not answer any more."""
     try:
         yield client
     finally:
@@ -182,9 +199,14 @@ def _versions() -> dict[str, str]:
 
 
 def _same_versions(client: dict[str, str], function: Callable[..., Any], *arguments: Any) -> Any:
-    """On a worker, which may have come late: results must not depend on who it is."""
-    own = _versions()
-    different = [f"{n} {own[n]}, not {client[n]}" for n in SAME if own[n] != client[n]]
+    """Call a function on a worker, if it has the client's versions of the packages in `SAME`.
+
+    Each task asks, since a worker may join the cluster at any time.
+    """
+    here = _versions()
+    different = [
+        f"{name} {here[name]}, not {client[name]}" for name in SAME if here[name] != client[name]
+    ]
     if different:
         worker = importlib.import_module("distributed").get_worker().address
         versions = " and ".join(different)

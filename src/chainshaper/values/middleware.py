@@ -203,28 +203,30 @@ GURUM_DDS = Middleware(
 )
 
 MIDDLEWARES = (CYCLONE_DDS, FAST_DDS, CONNEXT, ZENOH, GURUM_DDS)
-"""All that are known, in the order in which thread names are compared with theirs."""
+"""All middlewares, in the order in which a thread's name is looked for among their names."""
 
 DEFAULT_MIDDLEWARE = FAST_DDS
-"""The one that ROS 2 takes where RMW_IMPLEMENTATION is not set."""
+"""The middleware that ROS 2 takes where RMW_IMPLEMENTATION is not set."""
 
 ROUTERS = frozenset(router for middleware in MIDDLEWARES for router in middleware.routers)
-"""The routers of all, by the name of the program as a node."""
+"""The routers of all middlewares, by the names of their programs as nodes."""
 
 
 def middleware_of(rmw: str | None) -> Middleware | None:
-    """The middleware of an RMW implementation; None: it is not known.
+    """Return the middleware of an RMW implementation; None: it is not known.
 
     >>> middleware_of("rmw_fastrtps_dynamic_cpp").rmw
     'rmw_fastrtps_cpp'
     """
-    known = (one for one in MIDDLEWARES if rmw is not None and rmw.startswith(one.rmw_prefix))
-    return next(known, None)
+    for middleware in MIDDLEWARES:
+        if rmw is not None and rmw.startswith(middleware.rmw_prefix):
+            return middleware
+    return None
 
 
 @functools.lru_cache(maxsize=1024)
 def thread_work(name: str) -> ThreadWork | None:
-    """What a middleware's thread of this name does; None: no middleware's thread has such a name.
+    """Return what a middleware's thread of this name does; None: none has such a name.
 
     >>> thread_work("recvUC"), thread_work("python3")
     ('receive', None)
@@ -237,22 +239,22 @@ def thread_work(name: str) -> ThreadWork | None:
 
 
 def runtime_work(names: Iterable[str]) -> dict[str, ThreadWork]:
-    """What the threads of a process do whose names are short words (:attr:`Middleware.runtimes`).
+    """Return what the threads of a process do whose names are a middleware's short words.
 
-    Returns name → work; empty where the process has too few of a middleware's words.
+    The result is name → work (:attr:`Middleware.runtimes`); it is empty if the process has too few
+    of the words.
 
     >>> runtime_work(["rx-0", "tx-0", "net-0", "main"])
     {'rx-0': 'receive', 'tx-0': 'transmit', 'net-0': 'connection'}
     """
-    listed = list(names)
-    found: dict[str, ThreadWork] = {}
+    words = {name: name.rpartition("-")[0] for name in names if is_runtime_name(name)}
+    work_by_name: dict[str, ThreadWork] = {}
     for middleware in MIDDLEWARES:
         works = dict(middleware.runtimes)
-        words = {name: name.rpartition("-")[0] for name in listed if is_runtime_name(name)}
         known = {name: word for name, word in words.items() if word in works}
         if known and len(set(known.values())) >= middleware.fewest_runtimes:
-            found |= {name: works[word] for name, word in known.items()}
-    return found
+            work_by_name |= {name: works[word] for name, word in known.items()}
+    return work_by_name
 
 
 def is_runtime_name(name: str) -> bool:
@@ -265,13 +267,16 @@ _RUNTIME_NAME = re.compile(rf"({_WORDS})-\d+")
 
 
 def rmw_of_vendor(gid: Iterable[int]) -> str | None:
-    """The RMW implementation whose endpoints' gids begin like this one."""
-    start = tuple(gid)[:2]
-    return next((one.rmw for one in MIDDLEWARES if one.vendor == start), None)
+    """Return the RMW implementation whose endpoints' gids begin like this one; None: not known."""
+    vendor = tuple(gid)[:2]
+    for middleware in MIDDLEWARES:
+        if middleware.vendor == vendor:
+            return middleware.rmw
+    return None
 
 
 def rmw_of_threads(names: Iterable[str]) -> str | None:
-    """The RMW implementation to which threads of these names belong."""
+    """Return the RMW implementation to which threads of these names belong; None: not known."""
     listed = list(names)
     for middleware in MIDDLEWARES:
         telling = middleware.telling_threads
@@ -281,7 +286,7 @@ def rmw_of_threads(names: Iterable[str]) -> str | None:
 
 
 def limit_by_thread(name: str) -> MiddlewareLimit | None:
-    """What is limited in a process with a thread of this name."""
+    """Return what is limited in a process with a thread of this name; None: nothing."""
     for middleware in MIDDLEWARES:
         for pattern, limit in middleware.limiting_threads:
             if re.fullmatch(pattern, name, re.DOTALL):
@@ -292,7 +297,7 @@ def limit_by_thread(name: str) -> MiddlewareLimit | None:
 def limit_by_settings(
     middleware: Middleware, distribution: str | None, environment: Mapping[str, str]
 ) -> MiddlewareLimit | None:
-    """What is limited on a middleware in a ROS 2 distribution, with the variables as they are."""
+    """Return what is limited on a middleware in a ROS 2 distribution and environment."""
     if distribution in middleware.nameless_distributions:
         return "unnamed"
     for variable, pattern, limit in middleware.limiting_settings:

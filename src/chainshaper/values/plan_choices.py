@@ -1,6 +1,6 @@
-"""What a plan can be asked for: the wishes of the planner, sweeps and the command line's options.
+"""What a user can choose about a plan: for the planner, for sweeps, and as command line options.
 
-This module imports nothing slow: the planner takes a while, `chainshaper plan --help` should not.
+This module imports nothing slow, as the planner does, so that `chainshaper plan --help` is quick.
 """
 
 from dataclasses import dataclass
@@ -17,37 +17,44 @@ Policy: TypeAlias = Literal[
     "let-per-chain",
     "pipelined",
 ]
-"""How the chain is scheduled: the paper's way, or one of those that it compares (section 2.5)."""
+"""How a chain is scheduled: by latency shaping, or as the paper compares with (section 2.5)."""
 
 Fallback: TypeAlias = Literal["bypass", "silence"]  # of an output without its shaping node
-STANDBY = "_standby"  # behind a shaping node's name: that of who then stands in for it
+STANDBY = "_standby"  # ends the name of the node that stands in for a shaping node
 
 Publication: TypeAlias = Literal["synchronous", "asynchronous", "in-process"]
-"""By a shaping node, by the publisher's own thread (section 3.2), or by a gate in its process."""
+"""What publishes an output in its slot.
+
+"synchronous": a shaping node. "asynchronous": the publisher's own thread (section 3.2).
+"in-process": a gate in the publisher's process.
+"""
 ShapingThread: TypeAlias = Literal["free", "in-slots"]
-"""Whether a shaping node's thread is timed by its gate alone, or runs in its server's slots."""
+"""Whether only its gate times a shaping node's thread, or it runs in its server's slots as well."""
 EqualPriorities: TypeAlias = Literal["apart", "round-robin"]
 """What servers of one core and one priority do: their slots are apart, or they take turns."""
 SlotEnds: TypeAlias = Literal["open-until-done", "closed"]
-"""What servers do at their slots' ends while their callbacks still run: they stay open until these
-are done, for as long as the cycle has room; or they close, as the paper's do."""
+"""What a server does at a slot's end while a callback still runs.
+
+"open-until-done": it stays open until the callback is done, as long as the cycle has room.
+"closed": it closes, as in the paper.
+"""
 NodeLanguage: TypeAlias = Literal["python", "cpp"]
 NodeChoice: TypeAlias = Literal["auto", "python", "cpp"]
-"""The shaping node that a user chooses; the rest is found out (:mod:`.splicing.node_kinds`)."""
+"""The shaping node that a user chooses; :mod:`.splicing.node_kinds` finds out the rest."""
 Solver: TypeAlias = Literal["exact", "pso", "random"]
 """What places latency bands; the paper uses particle swarm optimisation (section 3.3)."""
 Goal: TypeAlias = Literal["mean", "jitter", "gap"]
-"""What latency bands make small: the average, the jitter, or the distance between bands (LV)."""
+"""What latency bands minimise: the average, the jitter, or the distance between bands (LV)."""
 
 
 class Option(NamedTuple):
-    """How a wish stands on the command line; its name there is the field's, unless ``flag``."""
+    """How a wish looks on the command line."""
 
     help: str
-    panel: str | None = None
+    panel: str | None = None  # of the help
     metavar: str | None = None
-    least: int | None = None
-    flag: str | None = None
+    least: int | None = None  # value
+    flag: str | None = None  # None: the option has the name of the field
 
 
 BANDS, MARGIN = "Latency bands", "Margin"  # panels of the help
@@ -58,10 +65,11 @@ BANDS, MARGIN = "Latency bands", "Margin"  # panels of the help
 class Wishes:
     """The wishes for a plan, all but the modes of the system. Times in nanoseconds.
 
-    Without ``epsilon_ns`` the margin covers all cycles, also disturbed ones, but a share of
-    ``overrun_probability`` (None: 1 %, or as few as the sample shows). ``publish_slot_ns`` is Δ of
-    eq. 2 and 4. ``bands`` to ``seed`` go with the policy ``shaped``, see
-    :func:`~chainshaper.planning.bands.with_bands`; ``slot_start_ns`` with ``one-long-slot``.
+    * ``publish_slot_ns`` is Δ of eq. 2 and 4.
+    * Without ``epsilon_ns`` the margin covers all cycles, also disturbed ones, except a share of
+      ``overrun_probability`` (None: 1 %, or as few as the sample can show).
+    * ``bands`` to ``seed`` are for the policy ``shaped``, see
+      :func:`~chainshaper.planning.bands.with_bands`; ``slot_start_ns`` is for ``one-long-slot``.
     """
 
     policy: Annotated[Policy, Option("Scheduling policy.")] = "shaped"

@@ -1,4 +1,4 @@
-"""How long work says how far it is: the functions that it calls for that."""
+"""Functions that work calls to say how much of it is done."""
 
 from collections.abc import Callable
 from typing import TypeAlias

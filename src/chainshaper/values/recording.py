@@ -1,6 +1,6 @@
-"""A recording on disk: a folder with one Parquet file per event table and a `recording.json`.
+"""A recording on disk: a folder with a Parquet file for each event table and a `recording.json`.
 
-The latter has the conditions of the run, what was lost, and a checksum of every other file.
+`recording.json` has the conditions of the run, what was lost, and a checksum of every other file.
 """
 
 import io
@@ -36,13 +36,16 @@ INFO_FILE = "recording.json"
 FORMAT = 1
 MOST_ROWS = 1_000_000
 MOST_ROWS_PER_BYTE = 16
-"""A file has no more rows than both together; events as regular as a clock take four bytes each."""
+"""A file may have MOST_ROWS, and so many for each of its bytes.
+
+Real events take more room: even those as regular as a clock take four bytes each.
+"""
 _OR_AGAIN = ", or record the run again"
 Integer: TypeAlias = Annotated[int, Field(ge=-(1 << 63), lt=1 << 63)]
 
 
 class ThreadInfo(BaseModel, frozen=True):
-    """One thread as the kernel reported it while the application ran (not as it was asked for)."""
+    """A thread as the kernel reported it while the application ran (not as it was asked for)."""
 
     tid: Integer
     pid: Integer
@@ -75,18 +78,14 @@ class EndpointInfo(BaseModel, frozen=True):
 
 
 class StallMeterInfo(BaseModel, frozen=True):
-    """How the machine was watched: a sleeper on every core of ``cores`` (ns throughout).
-
-    ``median_lateness_ns`` is an ordinary wake-up's on each core. Where ``realtime`` is false,
-    stalls may be ordinary scheduling.
-    """
+    """How the machine was watched for stalls, by a sleeper on each core."""
 
     cores: tuple[Integer, ...]
-    period_ns: Integer
-    threshold_ns: Integer
-    wakeups: Integer
-    median_lateness_ns: tuple[Integer, ...]
-    realtime: bool
+    period_ns: Integer  # between two wake-ups
+    threshold_ns: Integer  # a wake-up that is later than this is a stall
+    wakeups: Integer  # of all sleepers
+    median_lateness_ns: tuple[Integer, ...]  # of ordinary wake-ups, on each core
+    realtime: bool  # False: a stall may be ordinary scheduling
 
 
 class InForceInfo(BaseModel, frozen=True):
@@ -97,13 +96,7 @@ class InForceInfo(BaseModel, frozen=True):
 
 
 class RecordingInfo(BaseModel, frozen=True):
-    """The facts of a recording that are not events.
-
-    ``clock_offset_ns`` is what to add to event times for CLOCK_REALTIME. ``lost`` counts events
-    that are known to be missing, by reason. ``trace_events`` counts all events of a trace that was
-    converted. Processes and threads have the numbers of ``pid_namespace`` (its inode); None: each
-    its own. ``worst_ns`` are the starts of cycles for which a flight recorder has written it.
-    """
+    """The facts of a recording that are not events."""
 
     format: Integer = FORMAT
     source: str  # live, simulated, lttng, preload, ebpf
@@ -111,37 +104,39 @@ class RecordingInfo(BaseModel, frozen=True):
     kernel: str = Field(default_factory=platform.release)
     distribution: str | None = None  # of ROS 2
     rmw: str | None = None
-    clock_offset_ns: Integer
+    clock_offset_ns: Integer  # added to the time of an event, it is CLOCK_REALTIME
     command: tuple[str, ...] = ()
     processes: dict[Integer, str] = {}  # pid → the node or command it runs
+    # Inode of the namespace in which processes and threads have their ids; None: each has the id
+    # of its own namespace.
     pid_namespace: Integer | None = None
     threads: tuple[ThreadInfo, ...] = ()
     endpoints: tuple[EndpointInfo, ...] = ()
     realtime: bool | None = None  # SCHED_FIFO for all threads that were to have it; None: unknown
     notes: tuple[str, ...] = ()
-    worst_ns: tuple[Integer, ...] = ()
-    lost: dict[str, Integer] = {}
-    trace_events: dict[str, Integer] = {}
+    worst_ns: tuple[Integer, ...] = ()  # starts of cycles for which a flight recorder has saved it
+    lost: dict[str, Integer] = {}  # how many events are known to be missing, by reason
+    trace_events: dict[str, Integer] = {}  # how many the converted trace had, by event
     stall_meter: StallMeterInfo | None = None
     chain: str | None = None  # the chain the application's description names first
     application: dict[str, Any] | None = None  # the description that ran, when we ran it
     plan: dict[str, Any] | None = None  # the plan in force, when one was
-    in_force: InForceInfo | None = None  # None: no plan was, or the recording is from before
-    # File → its CRC-32, as `crc32:89abcdef`; None in recordings from before there were any.
+    in_force: InForceInfo | None = None  # None: no plan was in force, or an old version recorded
+    # File → its CRC-32, as `crc32:89abcdef`; None: an old version recorded, without checksums.
     checksums: dict[str, str] | None = None
 
 
 @dataclass(frozen=True)
 class Recording:
-    """An open recording, or trace: ``info`` and the event tables, read at their first use."""
+    """An open recording or trace."""
 
     path: Path
     info: RecordingInfo
-    events: EventTables = field(repr=False)
+    events: EventTables = field(repr=False)  # each is read at its first use
 
 
 class _TablesOnDisk(Mapping[str, pl.DataFrame]):
-    """The tables of a folder; one of several parts is a folder of files."""
+    """The tables in a folder: each is a file or, if it has several parts, a folder of files."""
 
     def __init__(self, path: Path, checksums: Mapping[str, str]) -> None:
         self._path, self._checksums = path, checksums
@@ -176,11 +171,11 @@ class _TablesOnDisk(Mapping[str, pl.DataFrame]):
         return self._read[name]
 
     def _content(self, file: Path) -> bytes:
-        """A file's bytes, once it is sure that they are what was written."""
+        """Read a file. Raises InputError: its checksum is not that of what was written."""
         content = file.read_bytes()
         expected = self._checksums.get(str(file.relative_to(self._path)))
-        if expected is not None and expected != (found := _checksum(content)):
-            damage = f"damaged: its checksum is {found}, {INFO_FILE} says {expected}"
+        if expected is not None and expected != (checksum := _checksum(content)):
+            damage = f"damaged: its checksum is {checksum}, {INFO_FILE} says {expected}"
             raise InputError(f"{file}: {damage}; copy the recording again{_OR_AGAIN}")
         return content
 
@@ -193,7 +188,7 @@ class _TablesOnDisk(Mapping[str, pl.DataFrame]):
 
 @contextmanager
 def _readable(file: Path) -> Iterator[Path]:
-    """Inside, what is wrong with a table's file ends in an InputError."""
+    """Turn all errors of reading a table's file into an InputError."""
     try:
         yield file
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
@@ -209,9 +204,12 @@ def _checksum(*parts: bytes | memoryview) -> str:
 
 
 def event_counts(recording: Recording) -> pl.DataFrame:
-    """How often each event happened: ``event, count``, ordered by event.
+    """Count the events of a recording.
 
-    A tracer's events have their provider in front (``ros2:callback_start``), also unused ones.
+    Columns, ordered by event:
+        event: its name. Those of a trace begin with the provider (``ros2:callback_start``), and
+            include events that have no table.
+        count: how often it happened.
     """
     counts = getattr(recording.events, "counts", recording.info.trace_events)
     if not counts:
@@ -221,8 +219,8 @@ def event_counts(recording: Recording) -> pl.DataFrame:
 
 
 def lost_text(lost: Mapping[str, int]) -> str:
-    """What was lost while recording, by reason, in words; "nothing" is said as well."""
-    reasons = [f"{count} {what.replace('_', ' ')}" for what, count in lost.items() if count]
+    """Say what was lost while recording, by reason, or that it was nothing."""
+    reasons = [f"{count} {reason.replace('_', ' ')}" for reason, count in lost.items() if count]
     return f"lost while recording: {', '.join(reasons) or 'nothing'}"
 
 
@@ -235,16 +233,18 @@ def open_recording(path: str | Path) -> Recording:
     path = Path(path)
     file = path / INFO_FILE
     if not file.is_file():
-        what, place = "a folder without recording.json" if path.is_dir() else "no such folder", path
-        if path.is_file():
-            what, place = "a file, where the folder of a recording is wanted", Path("REC")
-        made = f"a recording is made with `chainshaper run APP.yaml -o {place}`, a trace, which is"
-        raise InputError(f"{path}: {what}; {made} accepted as well, with `ros2 trace`")
+        problem, output = "no such folder", path
+        if path.is_dir():
+            problem = "a folder without recording.json"
+        elif path.is_file():
+            problem, output = "a file, where the folder of a recording is wanted", Path("REC")
+        made = f"a recording is made with `chainshaper run APP.yaml -o {output}`, a trace, which is"
+        raise InputError(f"{path}: {problem}; {made} accepted as well, with `ros2 trace`")
     try:
         values = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{file}: not readable as JSON ({error}); record the run again") from error
-    # The format first: what else a newer one holds is not ours to judge.
+    # The format first: this version cannot know what else a newer one holds.
     format_ = values.get("format", FORMAT) if isinstance(values, dict) else FORMAT
     if format_ != FORMAT:
         reason = f"format {format_}, this chainshaper reads format {FORMAT}"
@@ -255,7 +255,7 @@ def open_recording(path: str | Path) -> Recording:
 
 
 def refuse_existing(path: str | Path) -> Path:
-    """The path, once it is sure that a folder can be written there and nothing overwritten."""
+    """Return the path if a new folder can be written there. Raises InputError: it cannot."""
     path = Path(path)
     free_place(path, path.exists() and not (path.is_dir() and not any(path.iterdir())))
     if os.path.ismount(path) or (path.exists() and path.samefile(".")):
@@ -272,8 +272,8 @@ def write_recording(
     """Write a recording, whole or not at all, and open it.
 
     ``tables`` may come in parts, one after the other in time, for a recording that is larger than
-    memory: a table of several is a folder of files. Raises InputError: ``path`` exists already.
-    OperationError: it cannot be written.
+    memory; a table with several parts becomes a folder of files. Raises InputError: ``path`` exists
+    already. OperationError: it cannot be written.
     """
     path = refuse_existing(path)
     try:
@@ -292,7 +292,7 @@ def write_recording(
 
 
 def _write_parts(folder: Path, parts: Iterable[EventTables]) -> dict[str, str]:
-    """Write the tables of all parts; the checksums of the files by their names in the folder.
+    """Write the tables of all parts; return the files' checksums, by their names in the folder.
 
     Threads write the tables of a part while the next part is made, so that a recording takes the
     time of making it or of writing it, whichever is longer. No more than two parts are in memory.
@@ -314,9 +314,9 @@ def _write_parts(folder: Path, parts: Iterable[EventTables]) -> dict[str, str]:
 
 
 def _next_file(file: Path, before: int, checksums: dict[Path, str]) -> Path:
-    """The file for the next part of a table, of which so many parts were written before.
+    """Return the file for the next part of a table, ``before`` parts of which are written.
 
-    A table of one part is a file, one of several parts is a folder of files.
+    A table of a single part is a file; when the second comes, a folder of files takes its place.
     """
     if before == 1:
         first = file.rename(file.with_suffix(".first"))
@@ -326,7 +326,7 @@ def _next_file(file: Path, before: int, checksums: dict[Path, str]) -> Path:
 
 
 def _write_table(file: Path, frame: pl.DataFrame, columns: PackedColumns) -> str:
-    """Write a file; its checksum. Tables of one part have ``columns`` in common."""
+    """Write a file; return its checksum. Tables of one part have ``columns`` in common."""
     parts = packed(frame, columns) if is_packable(frame) else [_written_by_polars(frame)]
     with os.fdopen(open_output(file), "wb") as stream:
         stream.writelines(parts)
@@ -336,7 +336,7 @@ def _write_table(file: Path, frame: pl.DataFrame, columns: PackedColumns) -> str
 
 
 def _written_by_polars(frame: pl.DataFrame) -> memoryview:
-    content = io.BytesIO()  # written directly, Polars reports a full disk as a wrong file
+    content = io.BytesIO()  # Polars would report a full disk as a wrong file
     frame.write_parquet(content, compression="zstd", compression_level=1, statistics=False)
     return content.getbuffer()
 
@@ -346,20 +346,20 @@ State: TypeAlias = Literal["good", "limited", "absent"]
 
 @dataclass(frozen=True)
 class Check:
-    """One ability: ``needed_for`` says what goes without it, ``remedy`` what would bring it."""
+    """An ability of the machine."""
 
     name: str
     state: State
-    found: str
-    needed_for: str
-    remedy: str = ""
+    found: str  # what there is, in words
+    needed_for: str  # what does not work without it
+    remedy: str = ""  # what would bring it
 
 
 @dataclass(frozen=True)
 class MachineReport:
-    """All checks, and the stalls seen while watching every core (`machine_stall` table)."""
+    """The checks of a machine, and the stalls that were seen on its cores."""
 
     checks: tuple[Check, ...]
-    stalls: pl.DataFrame
+    stalls: pl.DataFrame  # table `machine_stall`
     stall_meter: StallMeterInfo
-    watched_ns: int
+    watched_ns: int  # how long the cores were watched

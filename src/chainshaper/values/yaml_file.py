@@ -1,6 +1,7 @@
-"""YAML files that people write, read with PyYAML's lines and Pydantic's paths of wrong values.
+"""Read YAML files that people write into Pydantic models.
 
-A message has both: ``robot.yaml:14: nodes.node3.callbacks[0].execution: …``.
+A message about a wrong value names the line, which PyYAML knows, and the key, which Pydantic knows:
+``robot.yaml:14: nodes.node3.callbacks[0].execution: …``.
 """
 
 import difflib
@@ -41,11 +42,13 @@ _KINDS = {
     "bool_type": "true or false",
 }
 AS_YAML = "yaml"
-"""The Pydantic context in which durations are texts with units, on the way in and out."""
+"""The Pydantic context in which durations are texts with units, when read and when written."""
 
 LONGEST_DURATION_NS = 2**63 - 1
-LARGEST_FILE, DEEPEST, MOST_VALUES = 8 << 20, 100, 200_000
-_MOST_PROBLEMS = 20
+LARGEST_FILE = 8 << 20  # bytes
+DEEPEST = 100  # lists and mappings inside each other
+MOST_VALUES = 200_000  # in a file, its aliases written out
+_MOST_PROBLEMS = 20  # in a message
 
 
 def _duration_in(value: object, info: ValidationInfo) -> object:
@@ -81,13 +84,13 @@ def _full_name(value: str) -> str:
 
 
 Duration = Annotated[int, BeforeValidator(_duration_in), PlainSerializer(_duration_out)]
-"""Nanoseconds; with the context :data:`AS_YAML` a text with a unit, on the way in and out."""
+"""Nanoseconds; in the context :data:`AS_YAML` a text with a unit, when read and when written."""
 PositiveDuration = Annotated[Duration, AfterValidator(_above_zero)]
 FullName = Annotated[str, AfterValidator(_full_name)]
 
 
 class Part(BaseModel):
-    """A part of a YAML file; its fields in ``_ns`` have units there instead of the suffix."""
+    """A part of a YAML file. A field ``length_ns`` is called ``length`` there, and has a unit."""
 
     model_config = ConfigDict(
         frozen=True,
@@ -100,7 +103,7 @@ class Part(BaseModel):
 
 
 def wrong_value(reason: str, *where: str | int) -> PydanticCustomError:
-    """The error for a wrong value that a validator found, ``where`` in the model it checks."""
+    """Make the error for a wrong value, which is at ``where`` in the model that is validated."""
     return PydanticCustomError("wrong_value", "{reason}", {"reason": reason, "where": where})
 
 
@@ -121,7 +124,7 @@ def read_model(
     *,
     made_by: str,
 ) -> Model:
-    """A YAML file as a Pydantic model; ``made_by`` completes the sentence "such a file is …".
+    """Read a YAML file into a Pydantic model; ``made_by`` completes "such a file is …" in messages.
 
     Raises InputError: no such file, not YAML, or wrong values, each with its line, key, reason and
     remedy.
@@ -130,8 +133,8 @@ def read_model(
     root, plain = compose(read_text(path, made_by), path), PlainData(path)
     values = plain.of(root) if root is not None else None
     if not isinstance(values, dict):
-        found = "the file is empty" if root is None else "expected a YAML mapping (key: value)"
-        raise InputError(f"{path}:1: {found}; such a file is {made_by}")
+        problem = "the file is empty" if root is None else "expected a YAML mapping (key: value)"
+        raise InputError(f"{path}:1: {problem}; such a file is {made_by}")
     try:
         return model.model_validate(values, context=AS_YAML)
     except ValidationError as error:
@@ -144,7 +147,7 @@ def read_model(
 
 
 def read_text(path: Path, made_by: str) -> str:
-    """The text of a file that a person writes. Raises InputError: not readable, or no such text."""
+    """Read a file that a person writes. Raises InputError: it is not readable, or no such text."""
     such = f"such a file is {made_by}"
     try:
         with path.open("rb") as file:
@@ -179,7 +182,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def compose(text: str, name: str | Path) -> yaml.Node | None:
-    """The YAML nodes of a text, called ``name`` in messages. Raises InputError: it is not YAML."""
+    """Parse a text, called ``name`` in messages. Raises InputError: it is not YAML."""
     try:
         return yaml.compose(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
@@ -195,18 +198,18 @@ _SCALARS = yaml.SafeLoader("")
 
 
 def _scalar(node: yaml.ScalarNode) -> str | int | float | bool | None:
-    """A scalar's value. Dates and other things that no file of ours has are texts.
+    """Return a scalar's value. Dates and other types that no file of ours has are texts.
 
-    Raises ValueError: its tag says that it is something that it is not (``!!int ""``), or a number
-    is too large for any use.
+    Raises ValueError: its tag claims a type that the value does not have (``!!int ""``), or a
+    number has more than 64 bits.
     """
     try:
         value = _SCALARS.construct_object(node)
     except Exception as error:
-        # PyYAML's constructors raise whatever int, re or a dictionary does.
+        # PyYAML's constructors raise any error that int, re or a dictionary does.
         resolve: Any = _SCALARS.resolve
         if node.tag == resolve(yaml.ScalarNode, node.value, (True, False)):
-            return str(node.value)  # nothing in the file claims what it is: a malformed date
+            return str(node.value)  # PyYAML, not a tag in the file, takes it for a (wrong) date
         tag = node.tag.replace("tag:yaml.org,2002:", "!!")
         raise ValueError(f"{node.value!r} is no {tag}: write the value without a tag") from error
     if isinstance(value, int) and not -(1 << 63) <= value < 1 << 64:
@@ -216,19 +219,23 @@ def _scalar(node: yaml.ScalarNode) -> str | int | float | bool | None:
 
 @dataclass
 class PlainData:
-    """The plain data of YAML nodes; ``lines`` learns the line of every value on the way.
+    """Makes plain data of YAML nodes, and notes the line of every value.
 
-    In files of ``ours`` each collection is used once, and units stand in values. Aliases could make
-    any file refer to itself, or be a billion values on a page.
+    Files of formats that are ``ours`` have neither aliases nor keys in ``_ns`` (units are in the
+    values). In other files aliases are written out, but not without end: an alias could make a file
+    contain itself, or a page be a billion values.
     """
 
-    name: str | Path
+    name: str | Path  # of the file, in messages
     ours: bool = True
-    lines: dict[_Path, int] = field(default_factory=dict)
-    _seen: set[int] = field(default_factory=set)
+    lines: dict[_Path, int] = field(default_factory=dict)  # by the value's path
+    _seen: set[int] = field(default_factory=set)  # nodes, by their identity
 
     def of(self, node: yaml.Node, where: _Path = ()) -> object:
-        """The value of a node at a place. Raises InputError: it cannot be, or has a key twice."""
+        """Return the value of a node, which is at ``where`` in the file.
+
+        Raises InputError: it is wrong, or has a key twice.
+        """
         self.lines[where] = node.start_mark.line + 1
         if isinstance(node, yaml.ScalarNode):
             try:
@@ -253,8 +260,8 @@ class PlainData:
             if key in values:
                 raise self._wrong(key_node, place, "stands here a second time: remove one")
             if self.ours and key.endswith("_ns"):
-                own = key.removesuffix("_ns")
-                reason = f"unknown key: write {own!r}, and its value with a unit"
+                right = key.removesuffix("_ns")
+                reason = f"unknown key: write {right!r}, and its value with a unit"
                 raise self._wrong(key_node, place, reason)
             values[key] = self.of(value_node, place)
             self.lines[place] = key_node.start_mark.line + 1
@@ -265,10 +272,10 @@ class PlainData:
         return InputError(f"{self.name}:{line}: {_key_text(where)}: {reason}")
 
     def problems(self, error: ValidationError, model: type[BaseModel]) -> InputError:
-        """What a model refused, each with its line."""
+        """Make an error of all values that a model has refused, each with its line."""
         lines = []
         for where, reason in _explanations(error, model):
-            # A missing key has no line of its own: the mapping it is missing from has.
+            # A missing key has no line, so that of the mapping from which it is missing counts.
             places = (where[:end] for end in range(len(where), -1, -1))
             line = next((self.lines[place] for place in places if place in self.lines), 1)
             lines.append(f"{self.name}:{line}: {_key_text(where)}: {reason}")
@@ -276,34 +283,41 @@ class PlainData:
 
 
 @contextmanager
-def wrong_values_refused(model: type[BaseModel], what: str = "") -> Iterator[None]:
-    """Inside, values that a model may not have end in one InputError that begins with ``what``."""
+def wrong_values_refused(model: type[BaseModel], beginning: str = "") -> Iterator[None]:
+    """Turn a model's ValidationError into an InputError with this ``beginning``."""
     try:
         yield
     except ValidationError as error:
         wrong = [f"{_key_text(at)}: {reason}" for at, reason in _explanations(error, model)]
-        raise InputError(what + "; ".join(wrong)) from error
+        raise InputError(beginning + "; ".join(wrong)) from error
 
 
 def _key_text(where: _Path) -> str:
-    """``servers[1].slots[0]``"""
+    """Return a path as text, such as ``servers[1].slots[0]``."""
     text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in where)
     return text.removeprefix(".") or "the file"
 
 
 def _explanations(error: ValidationError, model: type[BaseModel]) -> list[tuple[_Path, str]]:
-    """The first wrong values; a list is not too short because one of its elements is wrong."""
+    """Return the first wrong values: where each is, and why it is wrong.
+
+    Pydantic also calls a list too short that has wrong elements, which is left out.
+    """
     details = error.errors()
     parents = {detail["loc"][:end] for detail in details for end in range(len(detail["loc"]))}
-    wrong = [d for d in details if d["type"] != "too_short" or d["loc"] not in parents]
-    found = [_explain(detail, model) for detail in wrong[:_MOST_PROBLEMS]]
+    wrong = [
+        detail
+        for detail in details
+        if detail["type"] != "too_short" or detail["loc"] not in parents
+    ]
+    explanations = [_explain(detail, model) for detail in wrong[:_MOST_PROBLEMS]]
     if len(wrong) > _MOST_PROBLEMS:
-        found.append(((), f"{len(wrong) - _MOST_PROBLEMS} more values are wrong"))
-    return found
+        explanations.append(((), f"{len(wrong) - _MOST_PROBLEMS} more values are wrong"))
+    return explanations
 
 
 def _explain(error: ErrorDetails, model: type[BaseModel]) -> tuple[_Path, str]:
-    """Where a value is wrong, and why and what to do, in words."""
+    """Return where a value is wrong, and in words why, and what to do."""
     where, context = tuple(error["loc"]), error.get("ctx", {})
     value = error["input"]
     shown = repr(value) if isinstance(value, str | int | float | None) else "what stands here"
@@ -329,6 +343,7 @@ def _explain(error: ErrorDetails, model: type[BaseModel]) -> tuple[_Path, str]:
 
 @cache
 def _known_keys(model: type[BaseModel]) -> list[str]:
+    """Return all keys that a file of this model may have anywhere."""
     schema = model.model_json_schema(by_alias=True)
     parts = [schema, *schema.get("$defs", {}).values()]
     return sorted({key for part in parts for key in part.get("properties", {})})

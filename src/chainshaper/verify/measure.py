@@ -1,12 +1,16 @@
 """Measuring a chain in a recording, and comparing the same chain in several recordings.
 
-:func:`hop_breakdown` says where the latency goes. A hop is a callback of the chain. Its
-*communication* is the time from the publication before it to its own start: transport, and waiting
-for its executor. Its *computation* is the time from its start to its publication: execution and
-pre-emption; without its *waiting*: for another callback of the node that publishes for it (a
-synchroniser that waits for its other input, a timer that publishes what was stored for it), in a
-gate for its slot, or for the thread of an asynchronous publisher. Over a complete traversal the
-three add up to the latency, so mean shares add up to one.
+:func:`hop_breakdown` shows where the latency goes. A hop is a callback of the chain, with three
+parts:
+
+* *communication*, from the publication before it to its start: transport, and waiting for its
+  executor;
+* *computation*, from its start to its publication, without the waiting: execution and pre-emption;
+* *waiting*: for another callback of the node that publishes for it (a synchroniser that waits for
+  its other input, a timer that publishes a stored message), for a slot in a gate, or for the thread
+  of an asynchronous publisher.
+
+Over a complete traversal the three add up to the latency, so their mean shares add up to 1.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,7 +38,7 @@ from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
 from chainshaper.verify.overruns import (
-    Outcome,
+    OverrunOutcome,
     dropped_in,
     gate_releases,
     into_open_slots,
@@ -43,49 +47,42 @@ from chainshaper.verify.overruns import (
 )
 from chainshaper.verify.predictions import JudgedPrediction, due_of, judge_prediction
 
-MOST_PROPOSED = 3  # chains, to who names none
+MOST_PROPOSED = 3  # chains that a message proposes
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What was recorded before the plan came into force, and after its release (ns)."""
+    """How much of a recording is left out, because the plan was not in force then."""
 
-    before_ns: int = 0
-    after_ns: int = 0
+    before_ns: int = 0  # before the plan came into force
+    after_ns: int = 0  # after its release
 
     @property
     def text(self) -> str | None:
-        """In words; None where it is nothing."""
-        before, after = (round(lasted, -6) for lasted in (self.before_ns, self.after_ns))
-        parts = [f"the first {duration_text(before)}, before the plan came into force"] * bool(
-            before
-        )
-        parts += [f"the last {duration_text(after)}, after it was released"] * bool(after)
+        """The same in words; None: nothing is left out."""
+        parts = []
+        if before := round(self.before_ns, -6):
+            parts.append(f"the first {duration_text(before)}, before the plan came into force")
+        if after := round(self.after_ns, -6):
+            parts.append(f"the last {duration_text(after)}, after it was released")
         return f"left out: {' and '.join(parts)}" if parts else None
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """A recording with its chain's latency analysis, of the time in which the plan was in force.
-
-    ``longest_stall_ns`` is the machine's own (None: it was not watched), ``overruns`` counts
-    outputs that came too late for their publish slot, per policy (None: nothing was gated),
-    ``outcomes`` says what became of those of the chain, and of the cycles behind them,
-    ``into_open_slots`` those that came in time, but too late to wait until their slot's start,
-    ``dropped`` messages that were lost at a gate, per reason (None: no gate decided). ``plan`` is
-    the plan in force, ``prediction`` its own beside this measurement; ``left_out`` names the rest.
-    """
+    """A chain in a recording, measured over the time in which the plan was in force."""
 
     recording: Recording
     analysis: LatencyAnalysis
-    longest_stall_ns: int | None
+    longest_stall_ns: int | None  # of the machine; None: it was not watched
     overruns: dict[str, int] | None
-    outcomes: dict[str, Outcome]
-    into_open_slots: int | None
-    dropped: dict[str, int] | None
-    plan: ChainPlan | None
-    prediction: JudgedPrediction | None
-    left_out: LeftOut
+    """Number of outputs that came too late for their publish slot, by policy; None: no gate."""
+    outcomes: dict[str, OverrunOutcome]  # what became of overruns, and of the next cycles
+    into_open_slots: int | None  # number of outputs that came when their slot had opened already
+    dropped: dict[str, int] | None  # number of messages lost at a gate, by reason; None: no gate
+    plan: ChainPlan | None  # in force
+    prediction: JudgedPrediction | None  # the plan's, beside this measurement
+    left_out: LeftOut  # of the recording
 
 
 @dataclass(frozen=True)
@@ -97,35 +94,38 @@ class Comparison:
 
     @property
     def remark(self) -> str | None:
-        """What makes its recordings hard to compare: other periods; None: nothing does."""
-        periods = {one.recording.path.name: one.analysis.period_ns for one in self.measurements}
+        """A warning that the chain has different periods in the recordings; None: it has not."""
+        periods = {
+            measurement.recording.path.name: measurement.analysis.period_ns
+            for measurement in self.measurements
+        }
         if len({*periods.values()} - {None}) < 2:
             return None
-        found = ", ".join(
+        starts = ", ".join(
             f"every {duration_text(period)} in {name}" for name, period in periods.items() if period
         )
-        return f"{self.chain} starts {found}: these are different applications"
+        return f"{self.chain} starts {starts}: these are different applications"
 
 
 class SeveralChainsError(InputError):
-    """No chain was named, and the recording has several, or none."""
+    """No chain was named, and the recording does not have exactly one."""
 
 
 def chain_of(recording: Recording, chain: str | None, flow: DataFlow | None = None) -> str:
-    """The chain that was asked for, that the recording itself names, or the only one in it.
+    """The text of the chain: ``chain``, or the one that the recording names, or its only one.
 
-    ``flow`` is the recording's data flow, where that has been resolved already. Raises
-    SeveralChainsError: none was asked for or named, and it has several, or none.
+    ``flow`` is the recording's data flow, if it has been resolved already. Raises
+    SeveralChainsError: no chain was named, and the recording has several, or none.
     """
     named = chain or recording.info.chain
     if named is not None:
         return named
     flow = flow or recorded_flow(recording)
-    found = enumerate_chains(graph_of(flow), limit=MOST_PROPOSED)
-    if found.complete and len(found.chains) == 1:
-        return found.chains[0].spec
-    known = " or ".join(f"--chain {one.spec}" for one in found.chains)
-    more = "" if found.complete else ", or others (`chainshaper chains`)"
+    enumeration = enumerate_chains(graph_of(flow), limit=MOST_PROPOSED)
+    if enumeration.complete and len(enumeration.chains) == 1:
+        return enumeration.chains[0].spec
+    known = " or ".join(f"--chain {proposed.spec}" for proposed in enumeration.chains)
+    more = "" if enumeration.complete else ", or others (`chainshaper chains`)"
     raise SeveralChainsError(
         f"{recording.path} names no chain of interest: "
         + (f"add {known}{more}" if known else "and no chain is in it, see `chainshaper graph`")
@@ -133,7 +133,7 @@ def chain_of(recording: Recording, chain: str | None, flow: DataFlow | None = No
 
 
 def taken_chain(recording: Recording, chain: str | None, spec: str) -> tuple[str, ...]:
-    """A note that ``spec`` was taken since it is the only chain; none where one was named."""
+    """A note that ``spec`` was taken because it is the only chain; () if a chain was named."""
     if chain is not None or recording.info.chain is not None:
         return ()
     return (f"no --chain was given: {spec} is the only chain in {recording.path}.",)
@@ -145,21 +145,21 @@ def measure_latency(
     plan: Plan | None = None,
     flow: DataFlow | None = None,
 ) -> Measurement:
-    """Analyse the end-to-end latency of one chain in a recording.
+    """Measure the end-to-end latency of a chain in a recording.
 
-    ``plan`` is the plan in force, for recordings that do not know it themselves; ``flow`` the
-    recording's data flow, where that has been resolved already.
+    ``plan`` is the plan in force, for a recording without it; ``flow`` is the recording's data
+    flow, if it has been resolved already.
     """
     return _measured(opened(recording), (chain,), plan, flow)[0]
 
 
 def opened(recording: Recording | str | Path) -> Recording:
-    """A recording as it is, or opened where it lies."""
+    """The recording itself, or the one at a path."""
     return recording if isinstance(recording, Recording) else open_source(recording)
 
 
 def _plan_of(recording: Recording, plan: Plan | None) -> Plan | None:
-    """The plan in force: the given one, or that of the recording."""
+    """The plan in force: the given one, or else that in the recording."""
     if plan is not None:
         return plan
     known = recording.info.plan
@@ -172,39 +172,45 @@ def _measured(
     plan: Plan | None,
     flow: DataFlow | None = None,
 ) -> list[Measurement]:
-    """The measurements of several chains in one recording, whose events are resolved once."""
+    """Measure several chains in a recording; its events are resolved once."""
     joint, info = _plan_of(recording, plan), recording.info
-    due = [] if joint is None else [due for one in joint.chains for due in due_of(one)]
+    due = [] if joint is None else [due for planned in joint.chains for due in due_of(planned)]
     spell, left_out = _in_force(recording)
     flow = flow or recorded_flow(recording)
-    if gated := [one for one in joint.chains if any(publisher_servers(one))] if joint else []:
-        flow = left_when_taken(flow, [one.chain.output for one in gated])
+    if (
+        gated := [planned for planned in joint.chains if any(publisher_servers(planned))]
+        if joint
+        else []
+    ):
+        flow = left_when_taken(flow, [planned.chain.output for planned in gated])
     if spell is not None:
         recording = replace(recording, events=events.happened(recording.events, *spell))
     measurements = []
     for chain in chains:
         spec = chain_of(recording, chain, flow)
         begun = _in_front(spec, joint)
-        found = analyse_latency(flow, begun, due=due, between=spell)
-        notes = (*taken_chain(recording, chain, spec), *info.notes, *found.notes)
-        analysis = replace(found, notes=notes)
+        measured = analyse_latency(flow, begun, due=due, between=spell)
+        notes = (*taken_chain(recording, chain, spec), *info.notes, *measured.notes)
+        analysis = replace(measured, notes=notes)
         output = analysis.chain.topics[-1]
-        own = None if joint is None else plan_of_chain(joint, output)
-        planned_for = own is not None and own.chain.output in (None, output)
-        if own is not None and planned_for:
-            _refuse_other_period(own, analysis, recording)
-        decided = gate_releases(recording, own, analysis)
+        own_plan = None if joint is None else plan_of_chain(joint, output)
+        planned_for = own_plan is not None and own_plan.chain.output in (None, output)
+        if own_plan is not None and planned_for:
+            _refuse_other_period(own_plan, analysis, recording)
+        decided = gate_releases(recording, own_plan, analysis)
         measurements.append(
             Measurement(
                 recording=recording,
                 analysis=analysis,
                 longest_stall_ns=longest_stall(recording),
-                overruns=overruns_in(recording, own, analysis, decided),
-                outcomes=outcomes_in(analysis, own),
+                overruns=overruns_in(recording, own_plan, analysis, decided),
+                outcomes=outcomes_in(analysis, own_plan),
                 into_open_slots=into_open_slots(decided),
                 dropped=dropped_in(decided),
-                plan=own,
-                prediction=judge_prediction(own, analysis) if own and planned_for else None,
+                plan=own_plan,
+                prediction=judge_prediction(own_plan, analysis)
+                if own_plan and planned_for
+                else None,
                 left_out=left_out,
             )
         )
@@ -212,8 +218,10 @@ def _measured(
 
 
 def _refuse_other_period(plan: ChainPlan, analysis: LatencyAnalysis, recording: Recording) -> None:
-    """Refuse to judge by a plan whose cycle is not the chain's period, or several of them (a source
-    may be faster than the cycle)."""
+    """Refuse to judge by a plan whose cycle is no multiple of the chain's period.
+
+    Several periods in a cycle are allowed: a source may be faster than the cycle.
+    """
     period = analysis.period_ns
     if period is not None and plan.cycle_ns % period:
         raise InputError(
@@ -224,19 +232,19 @@ def _refuse_other_period(plan: ChainPlan, analysis: LatencyAnalysis, recording: 
 
 
 def _in_front(chain: str, plan: Plan | None) -> str:
-    """A chain whose first topic is shaped, from in front of that shaping node.
+    """The text of a chain that begins in front of a shaping node of its first topic.
 
-    So is a chain of one callback, and the first topic under LET per callback.
+    A chain of one callback may have such a node, and so may the first topic under LET per callback.
     """
-    first, *others = chain.split("..")
+    first, *further = chain.split("..")
     inputs = {} if plan is None else {node.output: node.input for node in plan.shaping_nodes}
     if first not in inputs:
         return chain
-    return "..".join([inputs[first], *(others or [first])])
+    return "..".join([inputs[first], *(further or [first])])
 
 
 def _in_force(recording: Recording) -> tuple[tuple[int, int | None] | None, LeftOut]:
-    """When the plan was in force, if not throughout, and what was recorded besides."""
+    """When the plan was in force (None: throughout), and how much is left out."""
     spell, starts = recording.info.in_force, events.table(recording.events, "callback_start")
     if spell is None or not starts.height:
         return None, LeftOut()
@@ -248,7 +256,7 @@ def _in_force(recording: Recording) -> tuple[tuple[int, int | None] | None, Left
 
 
 def longest_stall(recording: Recording) -> int | None:
-    """The machine's longest stall while it was recorded (ns); None: it was not watched."""
+    """The longest stall of the machine in a recording (ns); None: it was not watched."""
     if recording.info.stall_meter is None:
         return None
     stalls = events.table(recording.events, "machine_stall")
@@ -260,9 +268,9 @@ def compare_recordings(
     chain: str | None = None,
     plan: Plan | None = None,
 ) -> Comparison:
-    """Measure the same chain, the first of several, in several recordings.
+    """Measure the same chain in several recordings; of several chains the plan's first.
 
-    ``plan`` was in force in the last of them, should that not say so itself.
+    ``plan`` was in force in the last of them, if that recording does not have the plan itself.
 
     Raises InputError: fewer than two recordings, or a chain that one of them does not have.
     """
@@ -279,39 +287,54 @@ def compare_chains(
 ) -> tuple[Comparison, ...]:
     """Measure every chain of an application in ``least`` recordings or more.
 
-    They are the chains of the plan that was in force in the last of them, if it has several;
-    otherwise each recording's own. ``chain`` names one. Raises: as :func:`compare_recordings`.
+    If the plan in force in the last of them has several chains, these are measured; else the chain
+    that each recording names. ``chain`` selects one. Raises: as :func:`compare_recordings`.
     """
     if len(recordings) < least:
         raise InputError("a comparison needs two recordings, such as `compare before after`")
-    every = [opened(recording) for recording in recordings]
-    joint = _plan_of(every[-1], plan)
-    chains = [] if joint is None or chain is not None else [one.chain.spec for one in joint.chains]
-    chains = chains if len(chains) > 1 else [chain or next(iter(chains), None)]
+    opened_recordings = [opened(recording) for recording in recordings]
+    joint = _plan_of(opened_recordings[-1], plan)
+    chains = (
+        []
+        if joint is None or chain is not None
+        else [planned.chain.spec for planned in joint.chains]
+    )
+    if len(chains) < 2:
+        chains = [chain or next(iter(chains), None)]
     columns = []
-    for number, recording in enumerate(every, start=1):
-        progress((number - 1) / len(every), f"analysing {recording.path}")
-        columns.append(_measured(recording, chains, plan if number == len(every) else None))
-    return tuple(Comparison(own[0].analysis.chain.spec, own) for own in zip(*columns, strict=True))
+    for number, recording in enumerate(opened_recordings, start=1):
+        progress((number - 1) / len(opened_recordings), f"analysing {recording.path}")
+        columns.append(
+            _measured(recording, chains, plan if number == len(opened_recordings) else None)
+        )
+    return tuple(
+        Comparison(measurements[0].analysis.chain.spec, measurements)
+        for measurements in zip(*columns, strict=True)
+    )
 
 
 PARTS = ("communication", "computation", "waiting")
 
 
 def hop_breakdown(analysis: LatencyAnalysis) -> pl.DataFrame:
-    """Communication, computation and waiting of every hop of a chain, over complete traversals.
+    """Make a frame of each hop's communication, computation and waiting, over complete traversals.
 
-    One row per hop: ``hop`` (from 0), ``callback_id``, ``node``, ``callback`` (a short text),
-    ``topic`` (that it publishes), ``count``, ``by_sibling`` (how often another callback of the
-    node published for it), and for all parts ``…_ns``, a struct ``{min, mean, max}`` in ns (null
-    without traversals, and for the first hop's communication), and ``…_share`` of the mean latency.
+    A row per hop:
+
+    * ``hop``: from 0.
+    * ``callback_id``, ``node``; ``callback``, a short text; ``topic`` that it publishes.
+    * ``count``: number of traversals.
+    * ``by_sibling``: how often another callback of the node published for it.
+    * ``communication_ns``, ``computation_ns``, ``waiting_ns``: structs ``{min, mean, max}`` in ns
+      (null without traversals, and for the first hop's communication).
+    * ``communication_share``, ``computation_share``, ``waiting_share``: of the mean latency.
     """
     path = analysis.graph.path(analysis.chain)
     complete = analysis.traversals.filter("complete")
     latency = pl.lit(complete["latency_ns"].mean(), dtype=pl.Float64)
     times = [f"{part}_ns" for part in PARTS]
-    found = analysis.hops.join(complete, on="traversal", how="semi").group_by("hop")
-    figures = found.agg(
+    by_hop = analysis.hops.join(complete, on="traversal", how="semi").group_by("hop")
+    figures = by_hop.agg(
         *(summary(pl.col(name)).alias(name) for name in times),
         count=pl.len(),
         by_sibling=(pl.col("via") == "sibling").sum(),
@@ -336,6 +359,8 @@ def hop_breakdown(analysis: LatencyAnalysis) -> pl.DataFrame:
 
 
 def part_shares(frame: pl.DataFrame) -> dict[str, float | None]:
-    """The parts' shares of the mean latency, over all hops; None without traversals."""
+    """Sum the parts' shares of the mean latency over all hops; None without traversals."""
     shares = {part: frame[f"{part}_share"].drop_nulls() for part in PARTS}
-    return {part: float(one.sum()) if len(one) else None for part, one in shares.items()}
+    return {
+        part: float(of_hops.sum()) if len(of_hops) else None for part, of_hops in shares.items()
+    }

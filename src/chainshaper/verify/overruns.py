@@ -1,17 +1,17 @@
 """Overruns in a recording: outputs that came behind the slot they were due in, and what was done.
 
-One that comes when its slot has opened already is in time, but a gate cannot hold it until the
-slot's start: it leaves at once, and later than all others. Those are counted, too.
+An output that comes when its slot has opened already is in time, but a gate cannot hold it until
+the slot's start: it leaves at once, and later than all others. Such outputs are counted as well.
 
-A gate records its decision for every message. The thread of an asynchronous publisher decides
-nothing; there the messages that were never sent count as discarded, and those that were sent in a
-later cycle than due as having waited.
+A gate records its decision about every message. The thread of an asynchronous publisher records
+none: there, messages that were never sent count as discarded, and messages that were sent in a
+later cycle than due count as having waited.
 
-Where several chains are shaped, a chain's figures are those of its own gates: of the rows that name
-one of them, and where rows name none, as in live recordings, each gate is a process.
+If several chains are shaped, a chain's figures are those of its own gates: the rows with the name
+of one of them. Rows without a name, as in live recordings, belong to the nodes of their process.
 
-Whatever the policy, an overrun is to be late by itself: the **next cycle** was hit where its output
-missed its slot too, or did not come, whatever the cause.
+An overrun must not delay the cycle after it, whatever the policy: the **next cycle** was hit if its
+output missed its slot as well, or did not come, for whatever cause.
 """
 
 from collections import Counter
@@ -32,27 +32,29 @@ from chainshaper.values import events
 from chainshaper.values.plan_choices import STANDBY
 from chainshaper.values.recording import Recording
 
+# What was done with an output that overran, by policy.
 _DONE = {
     "wait": "waited for the next slot",
     "discard": "discarded",
     "publish": "published at once",
     "next-slot": "left in the slot behind their mode's",
 }
+# What became of outputs while the shaping node was not there.
 _WITHOUT_NODE = {
     "bypass": "went around the shaping node, which was not there",
     "silence": "were not published, since the shaping node was not there",
 }
 
-_MOVES_SHOWN = 8
+_MOVES_SHOWN = 8  # in a text, the last ones
 
 
 def gate_releases(
     recording: Recording, plan: ChainPlan | None, analysis: LatencyAnalysis
 ) -> pl.DataFrame | None:
-    """The table `gate_release` with ``overrun``, which older recordings lack; None: there is none.
+    """The rows of `gate_release` for the analysed chain; None: no gate decided about it.
 
-    Of a plan it has the rows of its shaping nodes on the analysed chain and of their standbys, not
-    those of the plan's other sinks.
+    The column ``overrun`` is added to older recordings. With a plan these are the rows of its
+    shaping nodes on the chain, and of their standbys, without those of the plan's other sinks.
     """
     if "gate_release" not in recording.events:
         return None
@@ -60,18 +62,18 @@ def gate_releases(
     table = with_overrun(table, 0 if plan is None else cycles_until_output(plan))
     if plan is None:
         return table
-    nodes = [one for one in shaping_nodes(plan) if one.output in analysis.chain.topics]
-    names = [f"{one.name}{ending}" for one in nodes for ending in ("", STANDBY)]
+    nodes = [node for node in shaping_nodes(plan) if node.output in analysis.chain.topics]
+    names = [f"{node.name}{ending}" for node in nodes for ending in ("", STANDBY)]
     table = table.filter(pl.col("gate").is_in(names) | pl.col("gate").is_null())
     return _of_nodes(recording, table, [f"/{name}" for name in names]) if names else None
 
 
-def _of_nodes(recording: Recording, table: pl.DataFrame, own: Collection[str]) -> pl.DataFrame:
-    """The rows of a table but those of processes of which it is known that they run other nodes."""
+def _of_nodes(recording: Recording, table: pl.DataFrame, names: Collection[str]) -> pl.DataFrame:
+    """The rows of a table without those of processes that are known to run only other nodes."""
     nodes = named_nodes(recording.events)
-    ours = nodes.filter(pl.col("node").is_in(own))
-    others = nodes.join(ours, on="pid", how="anti")
-    return table.join(others, on="pid", how="anti", maintain_order="left")
+    of_names = nodes.filter(pl.col("node").is_in(names))
+    elsewhere = nodes.join(of_names, on="pid", how="anti")
+    return table.join(elsewhere, on="pid", how="anti", maintain_order="left")
 
 
 def overruns_in(
@@ -80,12 +82,14 @@ def overruns_in(
     analysis: LatencyAnalysis,
     decided: pl.DataFrame | None,
 ) -> dict[str, int] | None:
-    """How many outputs overran, per policy that was applied to them; None: nothing was gated.
+    """Count the outputs that overran, by the policy that was applied; None: nothing was gated.
 
-    ``decided`` is that of :func:`gate_releases`. Those that a standby dealt with, while the shaping
-    node was not there, count as overruns too.
+    ``decided`` is the frame of :func:`gate_releases`. Outputs that a standby published, or held
+    back, while the shaping node was not there, count as overruns as well.
     """
-    gated = [] if plan is None else [n for *_, nodes in publisher_servers(plan) for n in nodes]
+    gated = (
+        [] if plan is None else [node for *_, nodes in publisher_servers(plan) for node in nodes]
+    )
     if decided is None and not gated:
         return None
     counts = Counter[str](() if decided is None else decided["overrun"].drop_nulls())
@@ -101,20 +105,19 @@ def overruns_in(
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """Of a chain's outputs that overran under one policy, ``late`` left and ``discarded`` did not.
-    Behind ``followed`` of them the recording has the next cycle; ``next_hit`` of these were hit.
-    """
+class OverrunOutcome:
+    """What became of a chain's outputs that overran under one policy."""
 
-    late: int
-    discarded: int
-    followed: int
-    next_hit: int
+    late: int  # number of those that left
+    discarded: int  # number of those that did not
+    followed: int  # number of those whose next cycle is in the recording
+    next_hit: int  # number of these next cycles that were hit
 
 
-def outcomes_in(analysis: LatencyAnalysis, plan: ChainPlan | None) -> dict[str, Outcome]:
-    """What became of the outputs that overran, per policy that was applied to them; those that a
-    standby dealt with did not overrun.
+def outcomes_in(analysis: LatencyAnalysis, plan: ChainPlan | None) -> dict[str, OverrunOutcome]:
+    """Find what became of the outputs that overran, by the policy that was applied.
+
+    Outputs that a standby published, or held back, are not among them.
     """
     decided = analysis.decided.select("traversal", "overrun")
     decided = decided.filter(~pl.col("overrun").is_in([*_WITHOUT_NODE]).fill_null(False))
@@ -135,45 +138,47 @@ def outcomes_in(analysis: LatencyAnalysis, plan: ChainPlan | None) -> dict[str, 
         followed=pl.col("next_hit").count(),
         next_hit=pl.col("next_hit").sum(),
     )
-    return {row.pop("policy"): Outcome(**row) for row in figures.iter_rows(named=True)}
+    return {row.pop("policy"): OverrunOutcome(**row) for row in figures.iter_rows(named=True)}
 
 
-def next_cycles(outcomes: Mapping[str, Outcome]) -> str:
-    """How many of the cycles behind overruns were hit: ``1 of 3``."""
-    hit = sum(one.next_hit for one in outcomes.values())
-    return f"{hit} of {sum(one.followed for one in outcomes.values())}"
+def next_cycles(outcomes: Mapping[str, OverrunOutcome]) -> str:
+    """Text: how many of the cycles after overruns were hit, such as ``1 of 3``."""
+    hit = sum(outcome.next_hit for outcome in outcomes.values())
+    return f"{hit} of {sum(outcome.followed for outcome in outcomes.values())}"
 
 
 def into_open_slots(decided: pl.DataFrame | None) -> int | None:
-    """How many outputs came into their slot when it was open already; None: no gate decided.
+    """Count the outputs that came when their slot had opened already; None: no gate decided.
 
-    They took longer than the plan's L̄ + ε, and make up the jitter that a wide slot lets through.
+    They took longer than the plan's L̄ + ε. The jitter of a wide slot comes from them.
     """
     at_once = pl.col("overrun").is_null() & (pl.col("release") == pl.col("arrival"))
     return None if decided is None else decided.filter(at_once).height
 
 
 def moves_in(analysis: LatencyAnalysis) -> list[dict[str, int]]:
-    """From which cycle on (``from_ns``, its origin) the slots of a chain's output were moved, and
-    by how much from where the plan has them (``moved_ns``): slots that follow the latencies.
+    """List the moves of slots that follow the latencies.
+
+    Each has ``from_ns``, the origin of the first cycle with it, and ``moved_ns``, how far the slots
+    were then from where the plan has them.
     """
     moved = pl.col("moved_ns")
-    found = analysis.decided.sort("origin").filter(moved != moved.shift(1, fill_value=0))
-    return found.select(from_ns="origin", moved_ns=moved).to_dicts()
+    changes = analysis.decided.sort("origin").filter(moved != moved.shift(1, fill_value=0))
+    return changes.select(from_ns="origin", moved_ns=moved).to_dicts()
 
 
 def moves_text(moves: Sequence[Mapping[str, int]]) -> str:
-    """``moved 2 times, by +1.2 +0.8 ms``; of many the last."""
+    """Text of moves, with the last ones: ``moved 2 times, by +1.200 +0.800 ms``."""
     last = " ".join(f"{move['moved_ns'] / 1e6:+.3f}" for move in moves[-_MOVES_SHOWN:])
     more = "last " if len(moves) > _MOVES_SHOWN else ""
     return f"moved {len(moves)} {'time' if len(moves) == 1 else 'times'}, {more}by {last} ms"
 
 
 def dropped_in(decided: pl.DataFrame | None) -> dict[str, int] | None:
-    """How many messages gates received and did not let out, per reason, and how many DDS lost
-    before they reached one, where its numbers say so; None: no gate decided.
+    """Count the messages that gates did not let out, by reason; None: no gate decided.
 
-    The reasons are those of ``dropped`` in :mod:`chainshaper.values.events`.
+    With those that DDS lost before they reached a gate, if its sequence numbers show them. The
+    reasons are those of ``dropped`` in :mod:`chainshaper.values.events`.
     """
     if decided is None:
         return None
@@ -193,7 +198,11 @@ def dropped_text(dropped: dict[str, int]) -> str:
 
 def overruns_text(overruns: dict[str, int]) -> str:
     """``3 outputs were too late for their slot (2 discarded, 1 published at once)``."""
-    parts = [f"{n} {_WITHOUT_NODE[what]}" for what, n in overruns.items() if what in _WITHOUT_NODE]
+    parts = [
+        f"{count} {_WITHOUT_NODE[reason]}"
+        for reason, count in overruns.items()
+        if reason in _WITHOUT_NODE
+    ]
     treated = {policy: count for policy, count in overruns.items() if policy in _DONE}
     if treated or not parts:
         total = sum(treated.values())

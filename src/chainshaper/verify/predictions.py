@@ -1,20 +1,22 @@
-"""Holding a plan's prediction against what was measured.
+"""Judging a plan's prediction by a measurement.
 
 **The convention.** Eq. 5 represents a latency band by the end of its slot, x_α. A gate lets a
-message that waits go when its slot starts, at x_α − Δ; only one that arrives inside the slot
-leaves later. So every figure is predicted twice: as if each output left at the start of its
-slot, and at its end. A measurement should lie between the two, near the first.
+message that waits go when its slot starts, at x_α − Δ; only a message that arrives inside the slot
+leaves later. So every figure is predicted twice: as if each output left at the start of its slot,
+and as if at its end. A measurement should lie between the two, near the first.
 
-With **modes** an output leaves in the slot of its cycle's mode, and what comes behind that slot is
-late for it although there are others. Each mode is then compared by itself with the share of
-latencies that fit; the whole depends on how long each was in force, which no plan knows.
+With **modes** an output leaves in the slot of its cycle's mode. An output that comes behind that
+slot is late, although there are further slots. Each mode is then compared by itself with the share
+of latencies that fit. The figures of all modes together are not judged: they depend on how long
+each mode was in force, which no plan knows.
 
 **What is promised.** With the anchor `stamp` a gate promises the latency. With the anchor `cycle`,
-and where a back end holds back a publisher's thread, slots count from the start of the cycle: the
-place in the cycle is promised and judged, whenever in the cycle the chain began.
+and where a back end stops a publisher's thread, slots count from the start of the cycle: the place
+in the cycle is promised and judged, whenever in the cycle the chain began.
 
-A verdict is found from the range and the figure as they are printed. A range has room for what two
-finite samples may differ by, and no band is expected that so few outputs may well not have come in.
+A verdict compares the range and the figure as they are printed. The range has room for the
+difference between two finite samples. A band is not expected if, with so few outputs, it may well
+be empty by chance.
 """
 
 from collections.abc import Sequence
@@ -43,27 +45,25 @@ from chainshaper.verify.promises import (
     outputs_due,
 )
 
-MISSING = 0.003  # a band that is empty with no more than this probability is expected
+MISSING = 0.003  # a band is expected if it is empty with at most this probability
 
 
 @dataclass(frozen=True)
 class JudgedFigure:
-    """One figure: predicted with outputs at slot starts and at slot ends, and measured (ns).
+    """A figure as predicted, and as measured."""
 
-    ``holds``: the measured figure lies from ``from_ns`` to ``to_ns``, to the printed digit (None:
-    nothing was measured, or the plan has modes, and it depends on them).
-    """
-
-    at_start_ns: int
-    at_end_ns: int
-    from_ns: int
+    at_start_ns: int  # predicted, with each output at the start of its slot
+    at_end_ns: int  # predicted, with each output at the end of its slot
+    from_ns: int  # the range in which the measured figure should lie
     to_ns: int
     measured_ns: int | None
     holds: bool | None
+    """Whether it lies there, to the printed digit; None: nothing was measured, or the plan has
+    modes, on which the figure depends."""
 
     @property
     def worse(self) -> bool:
-        """Whether it is above what was predicted; below is better, and breaks no promise."""
+        """Whether it lies above the range; below is better, and breaks no promise."""
         return self.holds is False and (self.measured_ns or 0) > self.to_ns
 
     @property
@@ -73,27 +73,22 @@ class JudgedFigure:
 
 
 @dataclass(frozen=True)
-class BandHeld:
-    """One latency band, over undisturbed cycles whose output came in the cycle it was due.
-
-    ``inside`` counts outputs that left while the slot was open. ``jitter_at_most_ns`` is what a
-    band beside others promises (None: nothing). With modes it is that of ``mode``: ``late`` counts
-    the mode's outputs behind its slot, the shares are those of its others.
-    """
+class JudgedBand:
+    """A latency band, or a mode, over undisturbed cycles whose output was in time."""
 
     slot_start_ns: int
     slot_end_ns: int
-    predicted_share: float | None
-    count: int
-    share: float | None
-    inside: int
+    predicted_share: float | None  # of the outputs in time; of a mode: of its own outputs
+    count: int  # of outputs
+    share: float | None  # as measured
+    inside: int  # number of outputs that left while the slot was open
     min_ns: int | None
     mean_ns: int | None
     max_ns: int | None
     jitter_ns: int | None
     mode: str | None = None
-    late: int = 0
-    jitter_at_most_ns: int | None = None
+    late: int = 0  # number of the mode's outputs behind its slot
+    jitter_at_most_ns: int | None = None  # promised, if there are several bands; None: nothing is
 
     @property
     def wide(self) -> bool:
@@ -105,63 +100,60 @@ class BandHeld:
 
 @dataclass(frozen=True)
 class JudgedReceivers:
-    """What a plan promises until a receiver's callback starts, and what was measured (ns).
+    """The promised and measured times until a receiver's callback starts.
 
-    It is of outputs that were in time, and that the machine did not disturb on their way. ``count``
-    of them were received, ``behind`` of which came later than promised; ``most_behind`` may.
+    Of outputs that were in time, and that no stall disturbed on their way.
     """
 
     predicted_max_ns: int
     predicted_jitter_ns: int
-    max_ns: int | None
-    jitter_ns: int | None
-    count: int
-    behind: int
-    most_behind: int
+    max_ns: int | None  # measured
+    jitter_ns: int | None  # measured
+    count: int  # of outputs that were received
+    behind: int  # number of those that came later than promised
+    most_behind: int  # how many may
 
     @property
     def broken(self) -> str | None:
-        """The promise that the measurement breaks, with its figures; None: it does not."""
+        """Text of the broken promise, with its figures; None: it is kept."""
         if self.behind <= self.most_behind:
             return None
-        said = f"{self.behind} of {self.count} outputs received behind"
-        said += f" {milliseconds(self.predicted_max_ns)} ms, at"
-        return f"{said} {milliseconds(self.max_ns or 0)} ms at the latest"
+        return (
+            f"{self.behind} of {self.count} outputs received behind"
+            f" {milliseconds(self.predicted_max_ns)} ms,"
+            f" at {milliseconds(self.max_ns or 0)} ms at the latest"
+        )
 
 
 @dataclass(frozen=True)
 class JudgedPrediction:
-    """A plan's prediction beside the measurement, over undisturbed cycles.
-
-    The figures are latencies, or with ``counted_from`` the cycle places in it. ``late`` counts
-    outputs that missed their last slot; they are in the figures, not in the bands. ``outputs`` has
-    all that were due, in whatever cycle. Policies without slots have no ``bands``, plans that keep
-    no place for them no ``receivers``.
-    """
+    """A plan's prediction beside the measurement, over undisturbed cycles."""
 
     mean: JudgedFigure
     max: JudgedFigure
     jitter: JudgedFigure
-    bands: tuple[BandHeld, ...]
-    late: int
-    outputs: OutputsDue
+    bands: tuple[JudgedBand, ...]
+    """() for policies without slots."""
+    late: int  # number of outputs that missed their last slot; in the figures, not in the bands
+    outputs: OutputsDue  # all that were due, also in disturbed cycles
     counted_from: Literal["chain", "cycle"]
-    receivers: JudgedReceivers | None = None
+    """Whether the figures are latencies, or places in the cycle."""
+    receivers: JudgedReceivers | None = None  # None: the plan promises nothing about them
 
     @property
     def broken(self) -> tuple[str, ...]:
-        """Which promises the measurement breaks, each with its figures."""
+        """Texts of the promises that the measurement breaks, each with its figures."""
         named = {"average": self.mean, "maximum": self.max, "jitter": self.jitter}
         broken = [
-            f"{name} {milliseconds(one.measured_ns)} ms, not {one.range_text} ms"
-            for name, one in named.items()
-            if one.worse and one.measured_ns is not None
+            f"{name} {milliseconds(figure.measured_ns)} ms, not {figure.range_text} ms"
+            for name, figure in named.items()
+            if figure.worse and figure.measured_ns is not None
         ]
         broken += [
-            f"jitter of band {number} {milliseconds(one.jitter_ns)} ms,"
-            f" not {milliseconds(one.jitter_at_most_ns)} ms at most"
-            for number, one in enumerate(self.bands, start=1)
-            if one.wide and one.jitter_ns is not None and one.jitter_at_most_ns is not None
+            f"jitter of band {number} {milliseconds(band.jitter_ns)} ms,"
+            f" not {milliseconds(band.jitter_at_most_ns)} ms at most"
+            for number, band in enumerate(self.bands, start=1)
+            if band.wide and band.jitter_ns is not None and band.jitter_at_most_ns is not None
         ]
         if self.outputs.kept is False:
             most = f"{self.outputs.most_missed} at most" if self.outputs.most_missed else "none"
@@ -172,23 +164,24 @@ class JudgedPrediction:
 
     @property
     def jitter_text(self) -> str:
-        """The jitter beside its bound; of several bands that within each."""
-        inside = [one for one in self.bands if one.jitter_at_most_ns is not None]
-        if not inside:
+        """Text: the jitter and its bound; if there are several bands, within each."""
+        bounded = [band for band in self.bands if band.jitter_at_most_ns is not None]
+        if not bounded:
             jitter, most = self.jitter.measured_ns, self.jitter.to_ns
             measured = "not known" if jitter is None else f"{milliseconds(jitter)} ms"
             return f"jitter {measured}, at most {milliseconds(most)} ms"
         measured = ", ".join(
-            "no output" if one.jitter_ns is None else milliseconds(one.jitter_ns) for one in inside
+            "no output" if band.jitter_ns is None else milliseconds(band.jitter_ns)
+            for band in bounded
         )
-        bounds = dict.fromkeys(milliseconds(one.jitter_at_most_ns or 0) for one in inside)
+        bounds = dict.fromkeys(milliseconds(band.jitter_at_most_ns or 0) for band in bounded)
         return f"jitter within bands {measured} ms, at most {', '.join(bounds)} ms"
 
 
 def due_of(plan: ChainPlan) -> tuple[Due, ...]:
-    """When a plan has its outputs leave, as the analysis needs it: the chain's, other sinks'."""
-    last = {} if plan.modes is None else {m: band - 1 for m, band in plan.modes.bands.items()}
-    own = Due(
+    """When a plan has the outputs of the chain, and those of its further sinks, leave."""
+    last = {} if plan.modes is None else {mode: band - 1 for mode, band in plan.modes.bands.items()}
+    of_chain = Due(
         cycle_ns=plan.cycle_ns,
         cycles=cycles_until_output(plan),
         slots=publish_slots(plan),
@@ -201,9 +194,11 @@ def due_of(plan: ChainPlan) -> tuple[Due, ...]:
     for node in plan.further_shaping_nodes:
         server, cycles = server_of(plan, node.thread), cycles_until_output(plan, node)
         if server is not None:
-            sink = replace(own, cycles=cycles, slots=server.slots, last_slot={}, output=node.output)
+            sink = replace(
+                of_chain, cycles=cycles, slots=server.slots, last_slot={}, output=node.output
+            )
             sinks.append(sink)
-    return own, *sinks
+    return of_chain, *sinks
 
 
 def _from_cycle(plan: ChainPlan) -> bool:
@@ -213,9 +208,9 @@ def _from_cycle(plan: ChainPlan) -> bool:
 
 
 def judge_prediction(plan: ChainPlan, analysis: LatencyAnalysis) -> JudgedPrediction:
-    """Hold the prediction of the plan in force against the analysis of a recording.
+    """Judge the prediction of the plan in force by the analysis of a recording.
 
-    The analysis knows from :func:`due_of` when outputs were due.
+    That analysis was made with the instants of :func:`due_of`.
     """
     slots = slots_of_latency(plan)
     from_cycle = _from_cycle(plan)
@@ -226,19 +221,19 @@ def judge_prediction(plan: ChainPlan, analysis: LatencyAnalysis) -> JudgedPredic
     if plan.modes is None:
         known = shares if expected(plan) is not None else [None] * len(slots)
         for number, (slot, share) in enumerate(zip(slots, known, strict=True)):
-            own = in_time.filter(slot=number)
-            found = _band(slot, share, own, in_time.height)
+            of_band = in_time.filter(slot=number)
+            judged = _band(slot, share, of_band, in_time.height)
             if len(slots) > 1 and expected(plan) is not None:
                 most = jitter_within_band(plan, slot, last=slot == slots[-1])
-                found = replace(found, jitter_at_most_ns=most)
-            bands.append(found)
+                judged = replace(judged, jitter_at_most_ns=most)
+            bands.append(judged)
     else:
         for mode, band in plan.modes.bands.items():
-            own = outputs.filter(mode=mode)
+            of_mode = outputs.filter(mode=mode)
             promised = (plan.predicted.modes or {}).get(mode)
             share = (sum(shares[:band]) or None) if promised is None else promised.shares[0]
-            found = _band(slots[band - 1], share, own.filter(~pl.col("late")), own.height)
-            bands.append(replace(found, mode=mode, late=int(own["late"].sum())))
+            judged = _band(slots[band - 1], share, of_mode.filter(~pl.col("late")), of_mode.height)
+            bands.append(replace(judged, mode=mode, late=int(of_mode["late"].sum())))
     mean, longest, jitter = _figures(plan, slots, latency_statistics(outputs["judged_ns"]))
     return JudgedPrediction(
         mean=mean,
@@ -255,7 +250,7 @@ def judge_prediction(plan: ChainPlan, analysis: LatencyAnalysis) -> JudgedPredic
 def _receivers(
     plan: ChainPlan, analysis: LatencyAnalysis, from_cycle: bool
 ) -> JudgedReceivers | None:
-    """What is promised for those that receive the output, beside the measurement."""
+    """Judge the promise about the receivers of the output; None: the plan makes none."""
     promised = plan.predicted.receivers
     if promised is None:
         return None
@@ -264,12 +259,12 @@ def _receivers(
     known = analysis.traversals.filter(in_time).drop_nulls("reception_ns")
     at = known.select(place + pl.col("reception_ns") - pl.col("latency_ns")).to_series()
     share = max(OVERRUN_PROBABILITY, allowed_late_share(plan.margin))
-    found = latency_statistics(at)
+    statistics = latency_statistics(at)
     return JudgedReceivers(
         predicted_max_ns=promised.max_ns,
         predicted_jitter_ns=promised.jitter_ns,
-        max_ns=found.max_ns,
-        jitter_ns=found.jitter_ns,
+        max_ns=statistics.max_ns,
+        jitter_ns=statistics.jitter_ns,
         count=len(at),
         behind=int((at > promised.max_ns).sum()),
         most_behind=most_by_chance(len(at), share),
@@ -279,13 +274,13 @@ def _receivers(
 def _figures(
     plan: ChainPlan, slots: Sequence[Slot], measured: LatencyStatistics
 ) -> tuple[JudgedFigure, JudgedFigure, JudgedFigure]:
-    """Average, maximum and jitter: with outputs at slot starts and ends, with room, measured."""
+    """Judge average, maximum and jitter; the ranges have room for finite samples."""
     predicted = plan.predicted
     mean, longest, jitter = predicted.mean_ns, predicted.max_ns, predicted.jitter_ns
     publishing = 0
-    lowest_max, lowest_jitter = mean, 0  # of outputs that leave when they are ready
-    # Where outputs do not come in bands, their variance is not in the plan; between two limits it
-    # is at most (max − mean)·(mean − min).
+    lowest_max, lowest_jitter = mean, 0  # if outputs leave when they are ready
+    # Where outputs do not come in bands, the plan does not have their variance. Between two limits
+    # it is at most (max − mean)·(mean − min).
     variance = float(max(0, longest - mean) * max(0, mean - (longest - jitter)))
     seen = expected(plan)
     if seen is not None:
@@ -300,7 +295,7 @@ def _figures(
             if (1 - share) ** measured.count <= MISSING
         ] or starts[:1]
         lowest_max, lowest_jitter = sure[-1], sure[-1] - sure[0]
-        if plan.into_open_slot == "next-slot":  # all leave when a slot begins, and within it
+        if plan.into_open_slot == "next-slot":  # each output leaves within its slot
             publishing = ends[-1] - starts[-1]
     elif slots:
         longest, jitter = min(longest, slots[-1][0]), 0
@@ -309,15 +304,15 @@ def _figures(
     room = round(STANDARD_ERRORS * (variance * samples) ** 0.5)
 
     def figure(at_start: int, name: str, lowest: int, above: int = 0) -> JudgedFigure:
-        at_end, found = getattr(predicted, name), getattr(measured, name)
+        at_end, figure_ns = getattr(predicted, name), getattr(measured, name)
         low, high, holds = min(lowest, at_start), at_end + above, None
         if seen is not None and len(seen.leave_ns) == 1 and lowest == at_start:
             high = min(high, at_start + GATE_NS + SHORTEST_SLOT_NS)  # however wide the slot is
         high += GATE_NS if seen is None else 0  # as close as gates are to slots
-        if plan.modes is None and found is not None:
-            printed = [float(milliseconds(one)) for one in (low, found, high)]
+        if plan.modes is None and figure_ns is not None:
+            printed = [float(milliseconds(value)) for value in (low, figure_ns, high)]
             holds = printed == sorted(printed)
-        return JudgedFigure(at_start, at_end, low, high, found, holds)
+        return JudgedFigure(at_start, at_end, low, high, figure_ns, holds)
 
     return (
         figure(mean, "mean_ns", mean - room, room),
@@ -327,8 +322,10 @@ def _figures(
 
 
 def jitter_within_band(plan: ChainPlan, slot: Slot, *, last: bool) -> int:
-    """How far apart the outputs of one of several bands may be: as wide as its slot, into which
-    they come at any time. Into the last one all that are in time come before it opens.
+    """How far apart (ns) the outputs of one of several bands may be: the width of its slot.
+
+    Messages may arrive at any time of the slot, and then leave at once. Not so in the last slot: an
+    output in time arrives before it opens.
     """
     apart = STOPPED_THREAD_NS if any(publisher_servers(plan)) else GATE_NS
     length = slot[1] - slot[0]
@@ -338,12 +335,16 @@ def jitter_within_band(plan: ChainPlan, slot: Slot, *, last: bool) -> int:
 
 
 def _weighted(shares: Sequence[float], values: Sequence[float]) -> float:
+    """The sum of values, each times its share."""
     return sum(share * value for share, value in zip(shares, values, strict=True))
 
 
 def _outputs(slots: Sequence[Slot], analysis: LatencyAnalysis, judged: str) -> pl.DataFrame:
-    """Undisturbed complete traversals: ``judged_ns, place_ns, slot, mode, late``. The slot is that
-    which the gate released the message in, else the last that had started as the output came."""
+    """Make a frame of undisturbed complete traversals: ``judged_ns, place_ns, slot, mode, late``.
+
+    ``judged_ns`` is the column ``judged``. ``slot`` is that in which the gate released the message;
+    without a gate's decision, the last that had started when the output came.
+    """
     decided = analysis.decided.select("traversal", "slot", "mode", gated=True)
     started = [(pl.col("place_ns") >= start).cast(pl.Int32) for start, _ in slots]
     return analysis.calm.join(decided, on="traversal", how="left").select(
@@ -354,18 +355,18 @@ def _outputs(slots: Sequence[Slot], analysis: LatencyAnalysis, judged: str) -> p
     )
 
 
-def _band(slot: Slot, predicted: float | None, own: pl.DataFrame, total: int) -> BandHeld:
-    """The band of a slot: its ``own`` outputs, which were in time, of a ``total``."""
-    found, place = latency_statistics(own["judged_ns"]), pl.col("place_ns")
-    return BandHeld(
+def _band(slot: Slot, predicted: float | None, outputs: pl.DataFrame, total: int) -> JudgedBand:
+    """Judge the band of a slot by its ``outputs`` that were in time, of ``total`` ones."""
+    statistics, place = latency_statistics(outputs["judged_ns"]), pl.col("place_ns")
+    return JudgedBand(
         slot_start_ns=slot[0],
         slot_end_ns=slot[1],
         predicted_share=predicted,
-        count=found.count,
-        share=found.count / total if total else None,
-        inside=own.filter((place >= slot[0]) & (place < slot[1])).height,
-        min_ns=found.min_ns,
-        mean_ns=found.mean_ns,
-        max_ns=found.max_ns,
-        jitter_ns=found.jitter_ns,
+        count=statistics.count,
+        share=statistics.count / total if total else None,
+        inside=outputs.filter((place >= slot[0]) & (place < slot[1])).height,
+        min_ns=statistics.min_ns,
+        mean_ns=statistics.mean_ns,
+        max_ns=statistics.max_ns,
+        jitter_ns=statistics.jitter_ns,
     )

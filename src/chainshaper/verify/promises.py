@@ -1,9 +1,9 @@
 """What became of the outputs that were due, and whether a plan's promise about them was kept.
 
-A plan promises that of the outputs that are due a share at most comes later than its slot. One that
-never comes is not in time either, whatever the reason: discarded, lost on the way, never published,
-or its chain did not begin. So all of them count; what is judged elsewhere (in comparisons, sweeps,
-watches and budgets) is judged by this.
+A plan promises that at most a certain share of the outputs that are due misses its slot. An output
+that never comes is not in time either, for whatever reason: it was discarded, lost on the way or
+never published, or its chain did not begin. So all of these count. Comparisons, sweeps, watches and
+budgets all judge by this module.
 """
 
 import math
@@ -17,31 +17,27 @@ from chainshaper.analysis import LatencyAnalysis
 from chainshaper.planning import ChainPlan
 from chainshaper.planning.chain_plan import Evidence
 
-STANDARD_ERRORS = 3  # beyond so many, a figure is not what was predicted
+STANDARD_ERRORS = 3  # a figure that is off by more is not what was predicted
 NOT_PUBLISHED, NOT_BEGUN, NEVER_CAME = "not published", "not begun", "never came"
 
 
 @dataclass(frozen=True)
 class OutputsDue:
-    """How many outputs were ``due``, and what became of them.
+    """How many outputs were due, and what became of them."""
 
-    ``late`` came behind the slot or cycle they were due in (None: nothing says when they were),
-    ``absent`` never came, by reason. ``usual`` of the absent ones were not published by the
-    application, as often as in the recording that was planned from. ``promised`` is the share that
-    the plan says may be missed, at most (None: no plan was in force).
-    """
-
-    due: int
-    late: int | None
-    absent: Mapping[str, int] = field(default_factory=dict)
+    due: int  # number of outputs
+    late: int | None  # number of those behind their slot or cycle; None: it is not known
+    absent: Mapping[str, int] = field(default_factory=dict)  # number that never came, by reason
     usual: int = 0
-    promised: float | None = None
+    """Number of absent ones that the application did not publish, as in the recording from which
+    the plan was made."""
+    promised: float | None = None  # the share that may be missed; None: no plan was in force
 
     @classmethod
     def of(
         cls, count: int, late: int | None, incomplete: int, plan: ChainPlan | None = None
     ) -> "OutputsDue":
-        """Of so many outputs that came, and so many that did not, for no known reason."""
+        """Make it of numbers: ``count`` outputs came, ``incomplete`` never, for unknown reasons."""
         absent, due, usual = {NEVER_CAME: incomplete} if incomplete else {}, count + incomplete, 0
         if plan is not None:
             usual = _usual(plan.evidence, plan.evidence.incomplete, due, incomplete)
@@ -49,7 +45,7 @@ class OutputsDue:
 
     @property
     def missed(self) -> int:
-        """Outputs that were late or never came, but for the usual ones."""
+        """Number of outputs that were late or never came, without the usual ones."""
         return (self.late or 0) + sum(self.absent.values()) - self.usual
 
     @property
@@ -59,7 +55,7 @@ class OutputsDue:
 
     @property
     def most_missed(self) -> int | None:
-        """So many may be missed as promised, as far as chance goes."""
+        """How many may be missed under the promise, with room for chance; None: no promise."""
         if self.promised is None:
             return None
         return most_by_chance(self.due, self.promised)
@@ -83,29 +79,32 @@ class OutputsDue:
 
 
 def most_by_chance(count: int, share: float) -> int:
-    """How many of so many may be hit where this share is, as far as chance goes."""
+    """How many of ``count`` may be hit by chance, if a ``share`` of all is."""
     mean = count * share
     return math.floor(mean + STANDARD_ERRORS * math.sqrt(mean))
 
 
 def promised_by(plan: ChainPlan) -> float:
-    """The share of outputs that a plan says may be missed, at most."""
+    """The largest share of outputs that may be missed under a plan."""
     return plan.margin.overrun_probability or 0.0
 
 
 def _usual(evidence: Evidence, before: int, due: int, absent: int) -> int:
-    """How many of the ``absent`` are so as often as ``before``, in what was planned from."""
+    """How many of ``absent`` outputs are as usual.
+
+    ``before`` is how many were absent in the recording from which the plan was made.
+    """
     planned_from = evidence.samples + evidence.disturbed + evidence.incomplete
     return min(absent, most_by_chance(due, before / planned_from)) if before else 0
 
 
 def outputs_due(analysis: LatencyAnalysis, plan: ChainPlan | None = None) -> OutputsDue:
-    """What became of the outputs of a chain that were due, under a plan if one was in force."""
+    """Count the outputs of a chain that were due, under a plan if one was in force."""
     return _counted(analysis.traversals, analysis.not_begun, plan)
 
 
 def undisturbed_outputs_due(analysis: LatencyAnalysis) -> OutputsDue:
-    """The same without the cycles that the machine disturbed."""
+    """Do the same without the cycles that the machine disturbed."""
     return _counted(analysis.traversals.filter(~pl.col("disturbed")), analysis.not_begun, None)
 
 

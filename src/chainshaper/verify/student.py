@@ -1,6 +1,6 @@
 """Student's t distribution: how probable is a deviation, measured in its own standard errors?
 
-SciPy has it, but takes 125 MB of a robot's disk, and this is all that a robot needs of it.
+SciPy has it, but takes 125 MB of a robot's disk, and a robot needs no more of it than this.
 """
 
 from math import exp, lgamma, log
@@ -10,14 +10,14 @@ _MOST_TERMS = 500
 
 
 def t_tail(t: float, freedom: float) -> float:
-    """The probability of more than ``t``, with so many degrees of freedom."""
+    """The probability of a value above ``t``, with ``freedom`` degrees of freedom."""
     square = freedom + t * t
     beyond = _incomplete_beta(freedom / 2, 0.5, freedom / square, t * t / square) / 2
     return beyond if t >= 0 else 1 - beyond
 
 
 def t_quantile(probability: float, freedom: float) -> float:
-    """What is exceeded with a ``probability``, of at most one half (inverse of :func:`t_tail`)."""
+    """The value that is exceeded with a ``probability`` of 1/2 or less; inverts :func:`t_tail`."""
     low, high = 0.0, 1.0
     while t_tail(high, freedom) > probability:
         low, high = high, 2 * high

@@ -1,7 +1,7 @@
 """DDS as ROS 2 uses it: topic names, quality of service, and messages that begin with a Header.
 
-Messages are handled in serialized form, as a generic ROS 2 subscription does: what a node
-forwards is what it received, byte for byte, and the time spent here is DDS's own.
+Messages are handled in serialized form, as a generic ROS 2 subscription does: a node forwards the
+bytes that it received, and the time that this takes is DDS's alone.
 
 A domain of the live workload is closed: loopback only, no multicast, and a domain id that no
 other process of this machine uses.
@@ -56,7 +56,7 @@ class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
 
 @dataclass
 class Stamped(IdlStruct, typename="chainshaper_msgs::msg::dds_::Stamped_"):
-    """What the live workload's topics carry."""
+    """The type of the live workload's topics."""
 
     header: Header
     number: uint64
@@ -65,7 +65,7 @@ class Stamped(IdlStruct, typename="chainshaper_msgs::msg::dds_::Stamped_"):
 
 @dataclass
 class String(IdlStruct, typename="std_msgs::msg::dds_::String_"):
-    """What a topic carries on which modes are announced."""
+    """The type of topics on which modes are announced."""
 
     data: str
 
@@ -79,7 +79,7 @@ class Message:
 
 
 def closed_domain_configuration() -> str:
-    """Cyclone DDS configuration (XML) of a domain that stays on this machine."""
+    """Return the configuration of Cyclone DDS (XML) for a domain that stays on this machine."""
     return (
         '<CycloneDDS><Domain Id="any"><General>'
         '<Interfaces><NetworkInterface address="127.0.0.1" multicast="false"/></Interfaces>'
@@ -92,7 +92,7 @@ def closed_domain_configuration() -> str:
 
 
 def free_domain() -> int:
-    """A DDS domain id in which no process of this machine takes part.
+    """Return a DDS domain id in which no process of this machine takes part.
 
     Raises OperationError: all of them are in use.
     """
@@ -108,7 +108,7 @@ def free_domain() -> int:
 
 
 def data_message(data: bytes | memoryview, stamp_ns: int, number: int = 0) -> bytes:
-    """A message with a number and ``data`` behind a header with a stamp of CLOCK_REALTIME."""
+    """Make a serialized message: a header with a stamp (CLOCK_REALTIME), a number, and ``data``."""
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
     size = memoryview(data).nbytes
     head = _DATA_HEAD.pack(_LITTLE_ENDIAN, seconds, nanoseconds, 1, number, size)
@@ -116,29 +116,30 @@ def data_message(data: bytes | memoryview, stamp_ns: int, number: int = 0) -> by
 
 
 def data_of(message: bytes) -> memoryview:
-    """What :func:`data_message` put into a message: bytes that begin on a multiple of 32."""
+    """Return the data in a message of :func:`data_message`; it begins on a multiple of 32 bytes."""
     size = _DATA_HEAD.unpack_from(message)[-1]
     return memoryview(message)[_DATA_HEAD.size : _DATA_HEAD.size + size]
 
 
 def number_in(message: bytes) -> int:
-    """The number that :func:`data_message` put into a message."""
+    """Return the number in a message of :func:`data_message`."""
     return int(_DATA_HEAD.unpack_from(message)[-2])
 
 
 def text_message(text: str) -> bytes:
-    """A serialized ``std_msgs/String``."""
+    """Make a serialized ``std_msgs/String``."""
     return bytes(String(text).serialize())
 
 
 def _qos(reliability: str, depth: int, lifespan_ns: int | None = None) -> Any:
-    reliable = Policy.Reliability.Reliable(max_blocking_time=100_000_000)
-    return Qos(
-        reliable if reliability == "reliable" else Policy.Reliability.BestEffort,
-        Policy.History.KeepLast(depth),
-        Policy.Durability.Volatile,
-        *([] if lifespan_ns is None else [Policy.Lifespan(lifespan_ns)]),
-    )
+    policies = [Policy.History.KeepLast(depth), Policy.Durability.Volatile]
+    if reliability == "reliable":
+        policies.append(Policy.Reliability.Reliable(max_blocking_time=100_000_000))
+    else:
+        policies.append(Policy.Reliability.BestEffort)
+    if lifespan_ns is not None:
+        policies.append(Policy.Lifespan(lifespan_ns))
+    return Qos(*policies)
 
 
 def _topic(participant: Any, name: str, carries_text: bool) -> Any:
@@ -146,10 +147,10 @@ def _topic(participant: Any, name: str, carries_text: bool) -> Any:
 
 
 def _counted(matched: int) -> int:
-    """How many counterparts DDS counts. Raises OperationError: DDS refused to.
+    """Return how many counterparts DDS has counted. Raises OperationError: it refused to.
 
-    The package's own lists of them ask twice, for the number and for the list, and fail where a
-    counterpart is discovered between the two.
+    The package's lists of counterparts ask DDS twice, for the number and for the list, and fail
+    where a counterpart is discovered in between. So only the number is asked for.
     """
     if matched < 0:
         raise OperationError(f"DDS does not say who was found, code {matched}")
@@ -157,9 +158,9 @@ def _counted(matched: int) -> int:
 
 
 class Publisher:
-    """A writer of one topic that takes serialized messages.
+    """A writer of a topic that takes serialized messages.
 
-    Messages that a subscription has not taken ``lifespan_ns`` after they reached it are gone.
+    A message that a subscription has not taken ``lifespan_ns`` after it arrived is dropped.
     """
 
     def __init__(
@@ -172,37 +173,48 @@ class Publisher:
         *,
         carries_text: bool = False,
     ) -> None:
-        own, qos = _topic(participant, topic, carries_text), _qos(reliability, depth, lifespan_ns)
-        self._writer = DataWriter(participant, own, qos=qos)
+        self._writer = DataWriter(
+            participant,
+            _topic(participant, topic, carries_text),
+            qos=_qos(reliability, depth, lifespan_ns),
+        )
         self._handle = self._writer._ref
 
     def write(self, payload: bytes, source_timestamp: int) -> None:
+        """Write a message. Raises OperationError: DDS refuses."""
         code = ddspy_write_ts(self._handle, payload, source_timestamp)
         if code < 0:
             raise OperationError(f"DDS write failed with code {code}")
 
     def matched(self) -> int:
-        """Number of subscriptions that have found this publisher."""
+        """Return the number of subscriptions that DDS has matched with this publisher."""
         return _counted(self._writer._get_matched_subscriptions(self._handle, None, 0))
 
 
 class Subscription:
-    """A reader of one topic that gives serialized messages, oldest first."""
+    """A reader of a topic that returns serialized messages, oldest first."""
 
     def __init__(
         self, participant: Any, topic: str, reliability: str, depth: int, carries_text: bool = False
     ) -> None:
-        own = _topic(participant, topic, carries_text)
-        self._reader = DataReader(participant, own, qos=_qos(reliability, depth))
+        self._reader = DataReader(
+            participant,
+            _topic(participant, topic, carries_text),
+            qos=_qos(reliability, depth),
+        )
         self.condition = ReadCondition(self._reader, _ANY)
         self._handle = self._reader._ref
 
     def ready(self) -> bool:
-        # Cyclone counts the messages here; its own `triggered` is true for exactly one of them.
+        """Return whether there are messages to take."""
+        # Cyclone returns their number here. The package's `triggered` is true only if it is 1.
         return int(self.condition._triggered(self.condition._ref)) > 0
 
     def take(self) -> Message | None:
-        """The next message, None when there is none or it only reports a publisher's state."""
+        """Take the next message; None: there is none, or only news of a publisher's state.
+
+        Raises OperationError: DDS refuses.
+        """
         taken = ddspy_take(self._handle, _ANY, 1)
         if isinstance(taken, int):
             raise OperationError(f"DDS take failed with code {taken}")
@@ -210,5 +222,5 @@ class Subscription:
         return next(valid, None)
 
     def matched(self) -> int:
-        """Number of publishers that have found this subscription."""
+        """Return the number of publishers that DDS has matched with this subscription."""
         return _counted(self._reader._get_matched_publications(self._handle, None, 0))

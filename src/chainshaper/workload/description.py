@@ -19,11 +19,11 @@ from collections.abc import Iterator
 from dataclasses import MISSING, fields, replace
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_origin
 
 from pydantic import Field, create_model, model_validator
 
-from chainshaper.robot.gate import AtLeast, Gate, Late, Modes
+from chainshaper.robot.gate import Gate, GateModes, Late, limit_of
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Publication
 from chainshaper.values.yaml_file import (
@@ -47,14 +47,16 @@ Pair: TypeAlias = tuple[Duration, Duration]
 
 
 class ExecutionTime(Part):
-    """CPU time of one callback instance: exactly one of the distributions.
+    """CPU time of a callback instance, by exactly one of these distributions.
 
-    ``uniform`` has two limits, ``normal`` mean and standard deviation, and is redrawn outside
-    ``within``. ``samples`` are drawn in stretches of ``block`` consecutive ones (1: independently).
-    Callbacks with as many samples and the same block draw the same stretches, so that what was
-    measured together stays together (the moving block bootstrap of Künsch, 1989, with the circular
-    end of Politis and Romano, 1992). A ``sequence`` is gone through in its order, again and again:
-    what was recorded happens again.
+    * ``constant_ns``: always the same.
+    * ``uniform_ns``: the two limits.
+    * ``normal_ns``: mean and standard deviation. A value outside ``within_ns`` is drawn again.
+    * ``samples_ns``: drawn in stretches of ``block`` consecutive samples (1: independently).
+      Callbacks with as many samples and the same block draw the same stretches, so that what was
+      measured together stays together (the moving block bootstrap of Künsch, 1989, with the
+      circular end of Politis and Romano, 1992).
+    * ``sequence_ns``: taken in its order, again and again, so that what was recorded happens again.
     """
 
     constant_ns: Duration | None = None
@@ -90,16 +92,21 @@ class ExecutionTime(Part):
 
 
 class SimulationDescription(Part):
-    """What a machine has by itself and a simulation needs as a value.
+    """Properties of the machine, which a simulation needs as values.
 
-    CPU time: ``wake_up`` of a thread until it is at work, ``take`` of a message until its callback
-    begins, ``publish`` of a message, by its executor or its publisher thread, ``receive`` of a
-    message by a DDS thread (None: these compete with no thread), ``context_switch`` for the thread
-    switched to, ``preemption`` for one that is resumed. ``delivery`` is how long a message is under
-    way, ``deliveries`` the same to single nodes by topic,
-    ``quantum`` how long turns last where the plan has round robin, ``interrupts`` the share of
-    a core's time that interrupts and the stall meter take from callbacks (it counts as their CPU
-    time), ``drift`` how much faster the clocks of nodes are (ppm of a period).
+    * ``executor``: which of rclcpp's executors all nodes have.
+    * ``wake_up``: CPU time of a thread from its waking until it is at work.
+    * ``take``: CPU time from taking a message until its callback begins.
+    * ``publish``: CPU time of publishing a message, in the executor or the publisher thread.
+    * ``delivery``: how long a message is under way.
+    * ``deliveries``: the same to single nodes, by node and topic.
+    * ``receive``: CPU time of a DDS thread for a message; None: these compete with no thread.
+    * ``context_switch_ns``: CPU time that switching to a thread takes from it.
+    * ``preemption_ns``: CPU time that resuming a thread takes from it, which was pre-empted.
+    * ``quantum_ns``: how long turns last where the plan has round robin.
+    * ``interrupts``: the share of a core's time that interrupts and the stall meter take from
+      callbacks, which counts as the callbacks' CPU time.
+    * ``drift``: by how much the clocks of nodes are too fast, by node (ppm of a period).
 
     The defaults are medians of live runs on a virtual machine of two cores.
     """
@@ -119,7 +126,11 @@ class SimulationDescription(Part):
 
 
 class ModesDescription(Part):
-    """A gate's :class:`~chainshaper.robot.gate.Modes` and the ``topic`` that names the mode."""
+    """The modes of a gate, as :class:`~chainshaper.robot.gate.GateModes` has them.
+
+    * ``topic``: where modes are announced.
+    * ``bands``: which slot each mode has, from 1.
+    """
 
     topic: FullName
     bands: Annotated[dict[str, int], Field(min_length=1)]
@@ -131,15 +142,14 @@ def _gate_fields() -> dict[str, Any]:
     """Return the fields of a gate's description, from those that ``Gate`` declares."""
     described: dict[str, Any] = {}
     for declared in fields(Gate):
-        limits = get_args(declared.type)
-        least = next((limit.number for limit in limits if isinstance(limit, AtLeast)), None)
+        limit = limit_of(declared)
         type_: Any = Any  # slots and modes: `GateDescription` has types of its own for them
         if get_origin(declared.type) is Literal:
             type_ = declared.type
         elif declared.name.endswith("_ns"):
-            type_ = PositiveDuration if least == 1 else Duration
-        elif least is not None:
-            type_ = Annotated[int, Field(ge=least)]
+            type_ = PositiveDuration if limit and limit.number == 1 else Duration
+        elif limit is not None:
+            type_ = Annotated[int, Field(ge=limit.number)]
         default = ... if declared.default is MISSING else declared.default
         described[declared.name] = (type_, default)
     return described
@@ -159,10 +169,10 @@ class GateDescription(_DescribedGate):
     * ``phase_ns``: where cycles begin without a stamp, behind the common start; None: with the
       timer that starts the application's chain.
     * ``modes``: with the topic that announces them.
-    * ``moves``: from when on, behind the common start, and where the first slot begins then; the
-      others move with it.
-    * ``spin_ns``: for so long before a release the thread watches the clock.
-    * ``pause_ns``: for so long behind a publication the thread rests.
+    * ``moves``: shifts of all slots while the application runs. Of each, when it begins, after the
+      common start, and where in the cycle the first slot begins then.
+    * ``spin_ns``: how long before a release the thread watches the clock.
+    * ``pause_ns``: how long after a publication the thread rests.
     """
 
     slots: Annotated[tuple[Pair, ...], Field(min_length=1)]
@@ -200,30 +210,46 @@ class GateDescription(_DescribedGate):
         gate, modes = self._without_modes(), self.modes
         if modes is None:
             return gate
-        return replace(gate, modes=Modes(modes.bands, modes.default, modes.late))
+        slots = {mode: band - 1 for mode, band in modes.bands.items()}
+        return replace(gate, modes=GateModes(slots, modes.default, modes.late))
 
     def _without_modes(self) -> Gate:
         values = {declared.name: getattr(self, declared.name) for declared in fields(Gate)}
         return Gate(**values | {"phase_ns": self.phase_ns or 0, "modes": None})
 
     def moved(self, start_ns: int) -> list[tuple[int, int]]:
-        """The moves as a :class:`~chainshaper.robot.waiting.Queue` has them."""
+        """Return the moves of a run that starts then: each instant, and the shift (ns) from it on.
+
+        :class:`~chainshaper.robot.waiting.Queue` takes them so.
+        """
         return [(start_ns + since, begin - self.slots[0][0]) for since, begin in self.moves]
 
 
 class CallbackDescription(Part):
-    """One callback: what triggers it, its execution time and the topics it publishes.
+    """A callback: what triggers it, what it does, and the topics it publishes.
 
-    ``timer_ns`` is a timer's period, ``phase_ns`` delays its first expiry after the common start.
-    A callback that ``synchronises`` inputs executes and publishes when a message of each has come,
-    with the stamp of the first input's; one that is ``triggered_by`` one of them, at each of its
-    messages, with the newest of the others. ``afterwards`` is CPU time behind the publications.
-    Executors look at the ``kind`` service and client behind subscriptions of topics.
+    What triggers it, one of the first three:
 
-    With a ``gate`` it executes nothing and forwards what it received. One that ``announces`` modes
-    publishes their names in turn, each as a ``std_msgs/String``. One that ``computes`` calls a
-    Python function instead of spending time (:mod:`chainshaper.workload.executor`). ``group`` is
-    one of its node's ``callback_groups``; else it is in the node's own, a mutually exclusive one.
+    * ``timer_ns``: a timer of this period; ``phase_ns`` delays its first expiry after the common
+      start.
+    * ``subscription``: the messages of this topic.
+    * ``synchronises``: these topics, when a message of each has come. The stamp that it passes on
+      is that of the first topic's message.
+    * ``triggered_by``: one of the topics that it ``synchronises``: each message of that one
+      triggers it, with the newest message of each of the others.
+    * ``kind``: executors look at services and clients after subscriptions of topics.
+    * ``group``: one of its node's ``callback_groups``; None: the node's default group, which is
+      mutually exclusive.
+
+    What it does:
+
+    * ``execution``: CPU time before it publishes.
+    * ``afterwards``: CPU time after it has published.
+    * ``computes``: a Python function that is called instead of spending time
+      (:mod:`chainshaper.workload.executor`).
+    * ``publishes``: topics.
+    * ``announces``: names of modes, which it publishes in turn, each as a ``std_msgs/String``.
+    * ``gate``: it executes nothing, and forwards what it received in slots.
     """
 
     timer_ns: PositiveDuration | None = None
@@ -242,13 +268,14 @@ class CallbackDescription(Part):
 
     @property
     def subscriptions(self) -> tuple[str, ...]:
-        """All topics that are subscribed to for this callback: the gate's modes come first."""
-        modes = None if self.gate is None else self.gate.modes
-        return (*(() if modes is None else (modes.topic,)), *self.inputs)
+        """All topics that are subscribed to for this callback, that of the gate's modes first."""
+        if self.gate is None or self.gate.modes is None:
+            return self.inputs
+        return (self.gate.modes.topic, *self.inputs)
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The topics whose messages start it."""
+        """The topics whose messages trigger it."""
         return self.synchronises if self.subscription is None else (self.subscription,)
 
     @model_validator(mode="after")
@@ -281,11 +308,13 @@ class CallbackDescription(Part):
 class NodeDescription(Part):
     """A node in a process of its own.
 
-    ``core``, ``priority`` and ``dds_priority`` override ``scheduling``. One that is not ``bound``
-    to its core runs, live, on any; in a simulation its core is where it runs. A multi-threaded
-    executor has ``threads``, which stay on the ``cores`` in turn, or all on the one core: of a
-    callback group, callbacks run one at a time, or, where it is reentrant, whenever a thread is
-    free.
+    * ``core``, ``priority``, ``dds_priority``: instead of those in ``scheduling``.
+    * ``bound``: whether it stays on its core. If not, it runs on any core in a live run; in a
+      simulation it runs on its core all the same.
+    * ``threads``: of a multi-threaded executor. They stay on the ``cores`` in turn, or all on
+      ``core``.
+    * ``callback_groups``: of a mutually exclusive group, callbacks run one at a time; of a
+      reentrant one, whenever a thread is free.
     """
 
     callbacks: tuple[CallbackDescription, ...] = Field(min_length=1)
@@ -322,7 +351,10 @@ class NodeDescription(Part):
         return self
 
     def exclusive_group(self, callback: CallbackDescription) -> str | None:
-        """The group of which it runs alone; None: it may run beside any. "" is the node's own."""
+        """Return the group of which it runs alone; None: it may run beside any other callback.
+
+        "" is the node's default group.
+        """
         reentrant = self.callback_groups.get(callback.group or "") == "reentrant"
         return None if self.threads == 1 or reentrant else callback.group or ""
 
@@ -364,7 +396,7 @@ class Application(Part):
     def _consistent(self) -> "Application":
         published = {topic for _, callback in self.callbacks() for topic in callback.publishes}
         order: TopologicalSorter[str] = TopologicalSorter()  # generic from Python 3.11 on
-        same: dict[str, str] = {}
+        written: dict[str, str] = {}  # names in the file by full name
         for name, described in self.nodes.items():
             if not _NODE.fullmatch(name):
                 raise wrong_value("a node's name has letters, digits, _ and / only", "nodes", name)
@@ -372,12 +404,12 @@ class Application(Part):
                 self._refuse_unpublished(callback, published, ("nodes", name, "callbacks", number))
                 for topic in callback.publishes:
                     order.add(topic, *callback.inputs)
-            if (other := same.setdefault(node_name(name), name)) != name:
-                raise wrong_value(f"is the same name as {other!r}: rename one", "nodes", name)
+            if (namesake := written.setdefault(node_name(name), name)) != name:
+                raise wrong_value(f"is the same name as {namesake!r}: rename one", "nodes", name)
         for topic in self.topics:
             if topic not in published:
                 raise wrong_value("is published by no node: remove it", "topics", topic)
-        # A run takes its time: a chain that cannot be found in it is refused before.
+        # A run takes a while, so a chain that could not be found in its recording is refused here.
         known = {*published, *map(node_name, self.nodes)}
         for way_point in map(str.strip, self.chain.split("..")):
             if "/" + way_point.removeprefix("/") not in known:
@@ -400,7 +432,9 @@ class Application(Part):
                 if node not in self.nodes:
                     raise wrong_value("no such node: remove it", "simulation", key, node)
         for node, topics in described.deliveries.items():
-            read = {topic for one in self.nodes[node].callbacks for topic in one.subscriptions}
+            read = {
+                topic for callback in self.nodes[node].callbacks for topic in callback.subscriptions
+            }
             for topic in topics:
                 if topic not in read:
                     reason = f"the node does not subscribe to it, but to {', '.join(sorted(read))}:"
@@ -422,52 +456,61 @@ class Application(Part):
             raise wrong_value(reason, *where, "gate", "modes", "topic")
 
     def callbacks(self) -> Iterator[tuple[str, CallbackDescription]]:
-        """Every callback with the name of its node, in the order of the file."""
+        """Yield every callback with the name of its node, in the order of the file."""
         for name, node in self.nodes.items():
             for callback in node.callbacks:
                 yield name, callback
 
     def announced(self) -> set[str]:
-        """The topics that carry the names of modes (``std_msgs/String``)."""
-        return {topic for _, cb in self.callbacks() if cb.announces for topic in cb.publishes}
+        """Return the topics that carry the names of modes (``std_msgs/String``)."""
+        return {
+            topic
+            for _, callback in self.callbacks()
+            if callback.announces
+            for topic in callback.publishes
+        }
 
     def topic(self, name: str) -> TopicDescription:
-        """A topic's description, the default one where the file says nothing about it."""
+        """Return a topic's description; the default one where the file says nothing about it."""
         return self.topics.get(name, TopicDescription())
 
     def scheduling_of(self, node: str) -> Scheduling:
-        """Core and priority of a node's executor."""
-        own, executors = self.nodes[node], self.scheduling.executors
-        first = own.cores[0] if own.cores else own.core
+        """Return core and priority of a node's executor (of several cores, the first)."""
+        described, executors = self.nodes[node], self.scheduling.executors
+        first = described.cores[0] if described.cores else described.core
         core = executors.core if first is None else first
-        return Scheduling(core=core, priority=own.priority or executors.priority)
+        return Scheduling(core=core, priority=described.priority or executors.priority)
 
     def cores_of(self, node: str) -> tuple[int, ...]:
-        """The core of each thread of a node's executor."""
+        """Return the core of each thread of a node's executor."""
         cores = self.nodes[node].cores or (self.scheduling_of(node).core,)
         return tuple(cores[place % len(cores)] for place in range(self.nodes[node].threads))
 
     def dds_scheduling_of(self, node: str) -> Scheduling:
-        """Core and priority of a node's DDS threads."""
-        own, dds = self.nodes[node].dds_priority, self.scheduling.dds
-        return dds if own is None else Scheduling(core=dds.core, priority=own)
+        """Return core and priority of a node's DDS threads."""
+        priority, dds = self.nodes[node].dds_priority, self.scheduling.dds
+        return dds if priority is None else Scheduling(core=dds.core, priority=priority)
 
     def cores(self) -> dict[int, str]:
-        """Every core that threads of the application are bound to, with who asks for it."""
+        """Return every core that threads of the application are bound to, and what asks for it."""
         bound = [name for name, node in self.nodes.items() if node.bound]
         executors = {core: f"node {name}" for name in bound for core in self.cores_of(name)}
         return {self.scheduling.dds.core: "scheduling.dds", **executors}
 
 
 def node_name(name: str) -> str:
-    """A node's full name: with a leading slash."""
+    """Return a node's full name, which has a leading slash."""
     return "/" + name.strip("/")
 
 
 def origin_timer(
     application: Application, chain: str | None = None
 ) -> tuple[str, CallbackDescription]:
-    """The timer callback that starts a chain (the application's), or leads to it, and its node."""
+    """Return the timer callback that starts a chain, or leads to its start, and its node's name.
+
+    The chain is the application's, unless another is given. Raises InputError: no callback begins
+    it.
+    """
     chain = chain or application.chain
     first = chain.split("..")[0].strip().strip("/")
     starts = [
@@ -475,15 +518,19 @@ def origin_timer(
         for name, callback in application.callbacks()
         if f"/{first}" in callback.publishes or first == name.strip("/")
     ]
-    # Every topic has a publisher, and topics form no cycle: a timer is found.
+    # This ends at a timer, since every topic has a publisher, and topics form no cycle.
     while starts and all(callback.timer_ns is None for _, callback in starts):
         inputs = {topic for _, callback in starts for topic in callback.subscriptions}
-        starts = [one for one in application.callbacks() if inputs.intersection(one[1].publishes)]
+        starts = [
+            (name, callback)
+            for name, callback in application.callbacks()
+            if inputs.intersection(callback.publishes)
+        ]
     if not starts:
         lacks = f"has no /{first}, with which the chain {chain} begins"
         remedy = "plan again from a recording of this application"
         raise InputError(f"the application {application.name!r} {lacks}: {remedy}")
-    return next(one for one in starts if one[1].timer_ns is not None)
+    return next((name, callback) for name, callback in starts if callback.timer_ns is not None)
 
 
 def load_application(path: str | Path) -> Application:
@@ -495,7 +542,7 @@ def load_application(path: str | Path) -> Application:
 
 
 def application_as_written(application: Application) -> dict[str, Any]:
-    """The application as its YAML file would have it, durations with units, defaults left out."""
+    """Return the application as in a YAML file: durations with units, defaults left out."""
     return application.model_dump(
         mode="json", by_alias=True, exclude_defaults=True, context=AS_YAML
     )

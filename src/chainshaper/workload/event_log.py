@@ -1,10 +1,13 @@
-"""The event log of one process of the live workload: written without disturbing the process.
+"""The event log of a process of the live workload, which is written without disturbing the process.
 
-A trace point appends a few integers to an array in locked memory, in one step, so that threads
-may share the log; names are written once, at start-up. Nothing touches a file or a pipe before
-the run is over. No array gets long: one that does is given so many pages at a time that after half
-an hour its thread pauses for ten milliseconds. Nothing heavy is imported: the pages are locked into
-memory. The simulator notes its objects here as well, and has its log laid out alike.
+A trace point appends a few integers to an array, in one step of the interpreter, so that threads
+may share the log. Names are written once, at start-up. Nothing touches a file or a pipe before the
+run is over.
+
+The arrays are in locked memory. None gets long: after half an hour, enlarging a single array would
+allocate so many pages at once that its thread would pause for ten milliseconds. For the same reason
+nothing heavy is imported. The simulator notes its objects here as well, and its log has the same
+layout.
 """
 
 from array import array
@@ -30,7 +33,7 @@ LAYOUT: dict[str, tuple[str, ...]] = {
     "asynchronous_send": ("rmw_publisher_handle", "timestamp", "outcome", "duration"),
     "machine_stall": ("duration",),
 }
-"""What is recorded, and the order of its fields; its number is its place in this list."""
+"""Kinds of entries, and the order of their fields. The number of a kind is its place here."""
 ALSO_TAKEN = ("rcl_take", "rclcpp_take")  # only where a message was taken
 EVENTS: dict[str, tuple[str, ...]] = {
     **{name: (name,) for name in LAYOUT},
@@ -38,28 +41,31 @@ EVENTS: dict[str, tuple[str, ...]] = {
     "take": ("rmw_take", *ALSO_TAKEN),
     "execute": ("rclcpp_executor_get_next_ready", "rclcpp_executor_execute"),
 }
-"""The events that each stands for, all of the same instant."""
+"""The events for which each kind of entry stands; all have its instant."""
 
-WIDTH = 15  # number of what is recorded, time, thread, and up to twelve fields
-BLOCK = 1_000 * WIDTH  # numbers in an array, when the next one is begun
+WIDTH = 15  # numbers of an entry: its kind, time, thread, and up to twelve fields
+BLOCK = 1_000 * WIDTH  # numbers in an array before the next one is begun
 
-ABSENT = -1  # for null in fields that may be
+ABSENT = -1  # stands for null
 WORDS: dict[str, tuple[str, ...]] = {
-    **{"anchor": ANCHORS, "overrun": LATE, "messages": MESSAGES, "dropped": DROPPED},
+    "anchor": ANCHORS,
+    "overrun": LATE,
+    "messages": MESSAGES,
+    "dropped": DROPPED,
     "outcome": ("sent", "expired", "overwritten"),
 }
-"""Fields that hold words are recorded as places in these lists; ``mode`` in that of its gate."""
+"""Words are recorded as their places in these lists; a ``mode`` by its place among its gate's."""
 
 FIRST_HANDLE = 0x55D0_0000_0100  # like a real address; other processes have the same
 
 
 def number_of(field: str, word: str | None) -> int:
-    """The number under which a word of :data:`WORDS` is recorded."""
+    """Return the number by which a word of :data:`WORDS` is recorded."""
     return ABSENT if word is None else WORDS[field].index(word)
 
 
 class EventLog:
-    """Events of one process, and the objects of its node with their handles."""
+    """The events of a process, and the creation of its node's objects, which get their handles."""
 
     def __init__(self, clock: Callable[[], int] = monotonic_ns) -> None:
         self._blocks = [array("q")]
@@ -73,28 +79,39 @@ class EventLog:
         self.objects.append({"event": event, "time": self._clock(), **fields})
 
     def node(self, node: str, version: str) -> None:
-        """The process's node is created; ``node`` is its full name."""
+        """Record that the process's node is created; ``node`` is its full name."""
         self.init("rcl_init", context_handle=self.new_handle(), version=version)
         namespace, _, name = node.rpartition("/")
-        named = {"node_name": name, "namespace": namespace or "/"}
-        self.init("rcl_node_init", node_handle=self._node, rmw_handle=self.new_handle(), **named)
+        self.init(
+            "rcl_node_init",
+            node_handle=self._node,
+            rmw_handle=self.new_handle(),
+            node_name=name,
+            namespace=namespace or "/",
+        )
 
     def publisher(self, topic: str, depth: int, asynchronous: bool) -> tuple[int, int]:
-        """A publisher is created: its handle, and that of rmw."""
+        """Record that a publisher is created; return its handle, and that of rmw."""
         handle, rmw_handle = self.new_handle(), self.new_handle()
-        own = {"publisher_handle": handle, "rmw_publisher_handle": rmw_handle}
-        about = {"topic_name": topic, "queue_depth": depth, "asynchronous": int(asynchronous)}
-        self.init("rcl_publisher_init", node_handle=self._node, **own, **about)
+        self.init(
+            "rcl_publisher_init",
+            node_handle=self._node,
+            publisher_handle=handle,
+            rmw_publisher_handle=rmw_handle,
+            topic_name=topic,
+            queue_depth=depth,
+            asynchronous=int(asynchronous),
+        )
         return handle, rmw_handle
 
     def callback(self, symbol: str) -> int:
-        """A callback is registered: its handle."""
+        """Record that a callback is registered; return its handle."""
         handle = self.new_handle()
         self.init("rclcpp_callback_register", callback=handle, symbol=symbol)
         return handle
 
     def timer(self, callback: int, period_ns: int) -> int:
-        """A timer is created for a callback: its handle."""
+        """Record that a timer is created for a callback; return its handle."""
         handle = self.new_handle()
         self.init("rcl_timer_init", timer_handle=handle, period=period_ns)
         self.init("rclcpp_timer_callback_added", timer_handle=handle, callback=callback)
@@ -102,17 +119,25 @@ class EventLog:
         return handle
 
     def subscription(self, callback: int, topic: str, depth: int) -> tuple[int, int]:
-        """A subscription is created for a callback: its handle, and that of rmw."""
-        handle, rmw_handle, above = self.new_handle(), self.new_handle(), self.new_handle()
-        own = {"subscription_handle": handle, "rmw_subscription_handle": rmw_handle}
-        about = {"topic_name": topic, "queue_depth": depth}
-        self.init("rcl_subscription_init", node_handle=self._node, **own, **about)
-        self.init("rclcpp_subscription_init", subscription_handle=handle, subscription=above)
-        self.init("rclcpp_subscription_callback_added", subscription=above, callback=callback)
+        """Record that a subscription is created for a callback; return its handle, and rmw's."""
+        handle, rmw_handle, of_rclcpp = self.new_handle(), self.new_handle(), self.new_handle()
+        self.init(
+            "rcl_subscription_init",
+            node_handle=self._node,
+            subscription_handle=handle,
+            rmw_subscription_handle=rmw_handle,
+            topic_name=topic,
+            queue_depth=depth,
+        )
+        self.init("rclcpp_subscription_init", subscription_handle=handle, subscription=of_rclcpp)
+        self.init("rclcpp_subscription_callback_added", subscription=of_rclcpp, callback=callback)
         return handle, rmw_handle
 
     def point(self, entry: str) -> Callable[..., None]:
-        """A fast function of (time, *fields as in :data:`LAYOUT`) that records for its thread."""
+        """Return a fast function that records an entry of this kind, for the calling thread.
+
+        It takes the time (ns), then the fields in the order of :data:`LAYOUT`.
+        """
         number, blocks = list(LAYOUT).index(entry), self._blocks
         padding = (0,) * (WIDTH - 3 - len(LAYOUT[entry]))
 
@@ -126,5 +151,5 @@ class EventLog:
 
     @property
     def rows(self) -> bytes:
-        """All that was recorded: :data:`WIDTH` signed 64-bit numbers for each entry."""
+        """All entries, each of :data:`WIDTH` signed 64-bit numbers."""
         return b"".join(block.tobytes() for block in self._blocks)

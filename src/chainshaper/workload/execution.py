@@ -15,9 +15,9 @@ from chainshaper.workload.description import ExecutionTime
 Int64s: TypeAlias = npt.NDArray[np.int64]
 BLOCK = 1024
 FIRST_AFTER = 1 << 16
-"""Sequences of what callbacks do behind their publications count from here; callbacks, from 0."""
-_DATA = bytes(16_384)  # so many that `crc32` releases the interpreter's lock
-_STEP_NS = 30_000  # longer than their checksum takes
+"""Added to a callback's index, it is the index of what that callback does after publishing."""
+_DATA = bytes(16_384)  # so much that `crc32` releases the interpreter's lock
+_STEP_NS = 30_000  # longer than `crc32` of it takes
 
 
 def draw(times: ExecutionTime, number: int, random: np.random.Generator) -> Int64s:
@@ -57,12 +57,13 @@ def blocks(times: ExecutionTime, seed: int, node: str, index: int) -> Iterator[I
             yield measured[(first + np.arange(BLOCK)) % len(measured)]
     together = times.block > 1
     random = np.random.default_rng([seed] if together else [seed, zlib.crc32(node.encode()), index])
-    while True:  # values that are drawn again must not depend on how many are asked for at once
+    # Always as many at once: which values of `normal` are drawn again depends on it.
+    while True:
         yield draw(times, BLOCK, random)
 
 
 class ExecutionTimes:
-    """A callback's sequence, value by value; drawn beforehand, so that an instance only spends."""
+    """A callback's sequence of execution times, value by value, drawn before they are needed."""
 
     def __init__(self, times: ExecutionTime, seed: int, node: str, index: int) -> None:
         self._blocks = blocks(times, seed, node, index)
@@ -74,7 +75,7 @@ class ExecutionTimes:
             self._values.extend(next(self._blocks).tolist())
 
     def next(self) -> int:
-        """The execution time of the next instance."""
+        """Return the execution time of the next instance (ns)."""
         self.refill(1)
         return self._values.popleft()
 
@@ -82,7 +83,7 @@ class ExecutionTimes:
 def spend(cpu_ns: int, since_ns: int, *, beside_others: bool = False) -> None:
     """Compute until this thread has used ``cpu_ns`` since its CPU clock showed ``since_ns``.
 
-    ``beside_others``: without the interpreter's lock, so that other threads compute meanwhile.
+    With ``beside_others`` it releases the interpreter's lock, so that other threads compute, too.
     """
     clock = time.thread_time_ns
     until = since_ns + cpu_ns

@@ -1,34 +1,36 @@
 """What runs in a node: executor, synchroniser, publisher thread, and what callbacks do.
 
-**Executor.** As rclcpp's `SingleThreadedExecutor` (Casini et al., ECRTS 2019): wait until something
-is ready, take a snapshot of all that is, then run it to the end: timers first, then subscriptions,
-each in the order of registration and each at most once. What becomes ready meanwhile waits for the
-next snapshot. A timer that missed whole periods fires once and keeps its phase.
+**Executor.** With one thread it works as rclcpp's `SingleThreadedExecutor` (Casini et al., ECRTS
+2019). It waits until something is ready, takes a snapshot of all that is, and runs that to its end:
+timers first, then subscriptions, each in the order of registration and at most once. What becomes
+ready meanwhile waits for the next snapshot. A timer that missed whole periods fires once and keeps
+its phase.
 
-With several threads it is as rclcpp's `MultiThreadedExecutor` (Jazzy): one of them at a time takes
-the next of the snapshot, or waits if none is left; the others wait for their turn. While a callback
-of a mutually exclusive group runs, the others are no part of a snapshot, and when it is done, the
-thread that waits looks again.
+With several threads it works as rclcpp's `MultiThreadedExecutor` (Jazzy). One thread at a time
+takes the next entity of the snapshot or, if none is left, waits for the next snapshot; the other
+threads wait for their turn. While a callback of a mutually exclusive group runs, no snapshot has
+entities of its group. When it is done, the thread that waits looks again.
 
-**Synchroniser** (message_filters). Each input has a subscription and a callback of its own. The
-callback that completes a set, of the oldest message of every input, computes and publishes; the
-others only leave their message.
+**Synchroniser** (message_filters). Each input has a subscription and a callback of its own. A set
+is the oldest message of every input. The callback whose message completes it computes and
+publishes; the other callbacks only leave their message.
 
 **Asynchronous publication.** As Fast DDS has it (paper, section 2.2): publishing puts the message
 into its writer's history, with the source timestamp of that instant, and wakes the **publisher
 thread** (``dds.asyn.…``), which sends for all asynchronous writers of the process.
 
 A reservation server may stop this thread while the executor goes on (section 3.2.1). So it waits
-in the kernel, without the interpreter's lock or one of DDS: woken while its server is closed, it
-stops before it returns to user space, and the executor, which only appends and wakes, never waits
-for it. Stopped in the midst of sending, however, it has both locks, and the process stands still:
-a publish slot has to be far longer than a send (:mod:`chainshaper.planning.overruns`).
+in the kernel, and holds neither the interpreter's lock nor one of DDS. If it is woken while its
+server is closed, it stops before it returns to user space, and the executor, which only appends and
+wakes, never waits for it. But if it is stopped while it sends, it holds both locks, and the whole
+process waits. So a publish slot has to be far longer than a send
+(:mod:`chainshaper.planning.overruns`).
 
 **Work.** A callback spends its described time, or calls the function that it ``computes:`` with
-the serialized messages that it is for (none for a timer, the whole set for a synchronising
-callback). The function returns the serialized message to publish on every topic of the callback,
-or None: nothing then. The stamp of the header, from which gates count, is the function's to pass on
-(:func:`~chainshaper.workload.dds.data_of` and :func:`~chainshaper.workload.dds.data_message` open
+the serialized messages that triggered it (none for a timer, the whole set for a synchroniser). The
+function returns the serialized message to publish on every topic of the callback, or None to
+publish nothing. Gates count from the stamp in the header, which the function has to pass on
+(:func:`~chainshaper.workload.dds.data_of` and :func:`~chainshaper.workload.dds.data_message` read
 and make messages).
 """
 
@@ -66,7 +68,7 @@ class Timer:
     period_ns: int
     callback: Callable[[], None]
     due_ns: int = 0
-    group: str | None = None  # that it is alone in
+    group: str | None = None  # of which its callback runs alone
 
     def call(self, now_ns: int) -> None:
         """Move on to the next expiry after ``now_ns``, as `rcl_timer_call` does."""
@@ -83,26 +85,26 @@ class SubscriptionEntity:
     rmw_handle: int
     subscription: Subscription
     callback: Callable[[Message], None]
-    group: str | None = None  # that it is alone in
+    group: str | None = None  # of which its callback runs alone
 
 
 Entity: TypeAlias = Timer | SubscriptionEntity
 
-IDLE_NS = 500_000_000  # between looks of an executor with nothing to do whether it is to end
+IDLE_NS = 500_000_000  # an executor with nothing to do looks so often whether it is to end
 
 
 class NodeExecutor:
-    """Runs the callbacks of one process on the calling thread, and on ``threads`` − 1 others.
+    """Runs the callbacks of a process on the calling thread, and on ``threads`` − 1 more.
 
-    Once ``over``, it ends when it next looks.
+    To end it early, set ``over``; it looks at that when it is done with a snapshot.
     """
 
     def __init__(self, participant: Any, log: EventLog, threads: int = 1) -> None:
         self.timers: list[Timer] = []
         self.subscriptions: list[SubscriptionEntity] = []
-        self.backlogs: list[Callable[[], bool]] = []
+        self.backlogs: list[Callable[[], bool]] = []  # each works some off; whether more is left
         self._wait_set = dds.WaitSet(participant)
-        # Never triggered: an empty wait set would return at once instead of waiting.
+        # An empty wait set would return at once instead of waiting. It also wakes a waiting thread.
         self._guard = dds.GuardCondition(participant)
         self._wait_set.attach(self._guard)
         self._wait_for_work = log.point("rclcpp_executor_wait_for_work")
@@ -110,41 +112,46 @@ class NodeExecutor:
         self.over = False
         self._turn = threading.Lock()
         self._snapshot: deque[Entity] = deque()
-        self._busy: set[str] = set()  # groups
+        self._busy: set[str] = set()  # groups of which a callback runs
         self._begin: queue.SimpleQueue[tuple[int, int]] = queue.SimpleQueue()
-        self._others: list[threading.Thread] = []
+        self._workers: list[threading.Thread] = []
         named = threading.Semaphore(0)
-        for _ in range(1, threads):  # they exist before they run: their priorities have to be set
-            other = threading.Thread(target=self._join_in, args=(named,), daemon=True)
-            other.start()
+        for _ in range(1, threads):  # they start before the run, so that they can get priorities
+            worker = threading.Thread(target=self._join_in, args=(named,), daemon=True)
+            worker.start()
             named.acquire()
-            self._others.append(other)
+            self._workers.append(worker)
 
     def add_subscription(self, entity: SubscriptionEntity) -> None:
+        """Add a subscription behind those that were added before."""
         self.subscriptions.append(entity)
         self._wait_set.attach(entity.subscription.condition)
 
     def spin_until(self, stop_ns: int, last_timer_ns: int) -> None:
         """Wait and run until ``stop_ns`` of CLOCK_MONOTONIC; a running callback is finished.
 
-        Timers expire up to ``last_timer_ns``, so that what they began can be completed. Backlogs,
-        what callbacks have taken beyond their own message, are worked off first.
+        Timers expire until ``last_timer_ns``, so that what they have started can be completed.
+        Backlogs, messages that a callback has taken beside that which triggered it, are worked off
+        before each wait.
         """
-        for _ in self._others:
+        for _ in self._workers:
             self._begin.put((stop_ns, last_timer_ns))
         self._spin(stop_ns, last_timer_ns)
-        for other in self._others:
-            other.join()
+        for worker in self._workers:
+            worker.join()
 
     def _join_in(self, named: threading.Semaphore) -> None:
+        """Be a worker: take the name, wait for the beginning, and run callbacks until the end."""
         set_thread_name(WORKER_NAME)
         named.release()
         try:
-            self._spin(*self._begin.get())
-        except BaseException as error:  # a thread would end alone, and its group stay busy
+            stop_ns, last_timer_ns = self._begin.get()
+            self._spin(stop_ns, last_timer_ns)
+        except BaseException as error:  # otherwise the thread alone would end, its group busy
             _end_process(error.code if isinstance(error, SystemExit) else traceback.format_exc())
 
     def _spin(self, stop_ns: int, last_timer_ns: int) -> None:
+        """Run callbacks on the calling thread until the end."""
         while (entity := self._next(stop_ns, last_timer_ns)) is not None:
             if isinstance(entity, Timer):
                 entity.callback()
@@ -158,7 +165,7 @@ class NodeExecutor:
                 self._guard.set(True)
 
     def _next(self, stop_ns: int, last_timer_ns: int) -> Entity | None:
-        """What this thread executes next, waited for; None at the end."""
+        """Wait for what this thread executes next; None: the end has come."""
         with self._turn:
             while True:
                 while self._snapshot:
@@ -177,21 +184,24 @@ class NodeExecutor:
 
     def _wait(self, stop_ns: int, last_timer_ns: int) -> None:
         """Wait until something is ready, or a group is free again, and take a snapshot."""
-        more, now = [work_off() for work_off in self.backlogs], monotonic_ns()
+        has_more, now = [work_off() for work_off in self.backlogs], monotonic_ns()
         free = [timer for timer in self.timers if timer.group not in self._busy]
         due = [timer.due_ns for timer in free if timer.due_ns <= last_timer_ns]
-        timeout = 0 if any(more) else max(0, min([stop_ns, now + IDLE_NS, *due]) - now)
-        for entity in self.subscriptions if self._others else ():
-            busy, condition = entity.group in self._busy, entity.subscription.condition
-            (self._wait_set.detach if busy else self._wait_set.attach)(condition)
+        timeout = 0 if any(has_more) else max(0, min([stop_ns, now + IDLE_NS, *due]) - now)
+        if self._workers:
+            for entity in self.subscriptions:
+                if entity.group in self._busy:
+                    self._wait_set.detach(entity.subscription.condition)
+                else:
+                    self._wait_set.attach(entity.subscription.condition)
         self._wait_for_work(now, timeout)
         self._wait_set.wait(timeout)
-        if self._others:
+        if self._workers:
             self._guard.set(False)
         now = min(monotonic_ns(), last_timer_ns)
         ready: list[Entity] = [timer for timer in self.timers if timer.due_ns <= now]
-        ready += [one for one in self.subscriptions if one.subscription.ready()]
-        self._snapshot.extend(one for one in ready if one.group not in self._busy)
+        ready += [entity for entity in self.subscriptions if entity.subscription.ready()]
+        self._snapshot.extend(entity for entity in ready if entity.group not in self._busy)
 
     def record_take(self, rmw_handle: int, message: Message) -> None:
         """Record that a message was taken for the callback that starts next."""
@@ -202,10 +212,10 @@ Input = TypeVar("Input")
 
 
 class Synchroniser(Generic[Input]):
-    """The messages that wait for their set, at most ``depths[i]`` of input i (the newest).
+    """The messages that wait for their set: of each input the newest, as many as its ``depths``.
 
-    With a ``trigger``, the number of an input, each of its messages makes a set with the newest of
-    the others, which are kept; without these it is gone.
+    With a ``trigger``, the number of an input, each message of that input makes a set with the
+    newest of every other input, which stay. If an input has none, there is no set.
     """
 
     def __init__(self, depths: Sequence[int], trigger: int | None = None) -> None:
@@ -213,7 +223,7 @@ class Synchroniser(Generic[Input]):
         self._trigger = trigger
 
     def add(self, number: int, message: Input) -> tuple[Input, ...]:
-        """A message of an input; the set that is complete now, or nothing."""
+        """Add a message of an input; return the set that it completes, or nothing."""
         self._waiting[number].append(message)
         if self._trigger is not None:
             complete = number == self._trigger and all(self._waiting)
@@ -234,10 +244,10 @@ Note: TypeAlias = Callable[[int, int, str, int], None]
 class AsynchronousWriter:
     """The history of one writer, between the executor and the publisher thread.
 
-    It has the last ``depth`` messages that are not sent yet; those older than ``lifespan_ns`` are
-    not sent any more. ``write`` gives a message and its source timestamp to DDS. Taking and
-    appending are single steps of the interpreter, so no lock is needed that a stopped thread could
-    hold.
+    It holds the last ``depth`` messages that are not sent yet. Messages older than ``lifespan_ns``
+    are not sent any more. ``write`` gives a message and its source timestamp to DDS. Taking and
+    appending are single steps of the interpreter, so no lock is needed, which a stopped thread
+    could hold.
     """
 
     def __init__(
@@ -253,10 +263,10 @@ class AsynchronousWriter:
         self._history: deque[tuple[bytes, int]] = deque()
 
     def publish(self, payload: bytes, source_timestamp: int) -> None:
-        """Executor: hand a message over, never waiting; a full history loses its oldest."""
+        """Executor: hand a message over without waiting; a full history loses its oldest."""
         self._history.append((payload, source_timestamp))
-        # Should the oldest be taken for sending just now, the one after it is lost: a message that
-        # is being sent has its place in the history, as in DDS.
+        # If the thread takes the oldest just now, the next one is lost instead. In DDS, too, a
+        # message that is being sent has a place in the history.
         if len(self._history) > self._depth and (oldest := self._oldest()) is not None:
             self._note(time.monotonic_ns(), oldest[1], "overwritten", 0)
         self._to_send.put(self)
@@ -288,9 +298,9 @@ def _end_process(said: object) -> None:
 
 
 def start_publisher_thread() -> "queue.SimpleQueue[AsynchronousWriter]":
-    """Start the one thread that sends for all asynchronous writers of this process.
+    """Start the thread that sends for all asynchronous writers of this process.
 
-    They put themselves into the queue, once for each message.
+    Writers put themselves into the queue that is returned, once for each message.
     """
     waiting: queue.SimpleQueue[AsynchronousWriter] = queue.SimpleQueue()
 
@@ -302,7 +312,7 @@ def start_publisher_thread() -> "queue.SimpleQueue[AsynchronousWriter]":
     def send_or_end() -> None:
         try:
             send()
-        except BaseException:  # a thread would end alone, and nothing be sent any more
+        except BaseException:  # otherwise the thread alone would end, and nothing be sent
             _end_process(traceback.format_exc())
 
     threading.Thread(target=send_or_end, daemon=True).start()
@@ -310,8 +320,11 @@ def start_publisher_thread() -> "queue.SimpleQueue[AsynchronousWriter]":
 
 
 Work = Callable[[Sequence[dds.Message], int, int], Iterable[bytes]]
-"""Of messages, and the wall clock and the thread's CPU clock (ns) at the callback's start: what is
-published on each topic, in their order, or nothing."""
+"""What a callback does before it publishes.
+
+It takes the messages, and what the wall clock and the thread's CPU clock showed at the callback's
+start (ns). It returns the message for each topic, in the topics' order, or nothing.
+"""
 
 
 def spending(
@@ -321,16 +334,16 @@ def spending(
     *,
     beside_others: bool = False,
 ) -> Work:
-    """Spend the next execution time; the first message's stamp is passed on to all topics.
+    """Return work that spends the next execution time, and passes the first message's stamp on.
 
-    ``templates`` has the data for each topic. What is ``announced`` is published in turn instead.
-    Messages are made first: what a callback does before it publishes is its execution time.
+    ``templates`` has the data for each topic. If messages are ``announced``, these are published in
+    turn instead. Messages are made first, so that making them is part of the execution time.
     """
     announcements = cycle(announced)
 
     def work(messages: Sequence[dds.Message], wall_ns: int, cpu_ns: int) -> Sequence[bytes]:
         stamp = (origin_of(messages[0].payload) or 0) if messages else wall_ns
-        made = [next(announcements, None) or dds.data_message(one, stamp) for one in templates]
+        made = [next(announcements, None) or dds.data_message(data, stamp) for data in templates]
         spend(times.next(), cpu_ns, beside_others=beside_others)
         return made
 
@@ -338,7 +351,10 @@ def spending(
 
 
 def computing(name: str, function: Callable[..., object], topics: int) -> Work:
-    """Call a loaded function; what it raises ends the process with one line that says where."""
+    """Return work that calls a function. If that raises, the process ends with a line that says so.
+
+    ``name`` is the function's, ``topics`` the number of topics.
+    """
 
     def work(messages: Sequence[dds.Message], _wall_ns: int, _cpu_ns: int) -> Sequence[bytes]:
         try:
@@ -357,15 +373,16 @@ def computing(name: str, function: Callable[..., object], topics: int) -> Work:
 
 
 def load_function(name: str) -> Callable[..., object]:
-    """The function that ``MODULE:FUNCTION`` names; ends the process if there is none.
+    """Load the function that ``MODULE:FUNCTION`` names; end the process if there is none.
 
-    Nothing is loaded from a folder of PYTHONPATH, or the working one, that others may change.
+    Nothing is loaded from folders that other users may change, be they in PYTHONPATH or the
+    working directory.
     """
     module, _, attribute = name.partition(":")
     places = {folder: why_distrusted(folder) for folder in (*named_folders(), str(Path.cwd()))}
     sys.path += [folder for folder, reason in places.items() if reason is None]
     try:
-        found = getattr(importlib.import_module(module), attribute, None)
+        function = getattr(importlib.import_module(module), attribute, None)
     except Exception as error:
         file, line, words = _explained(error)
         where = "" if file.startswith("<frozen") else f" ({file}:{line})"
@@ -374,15 +391,15 @@ def load_function(name: str) -> Callable[..., object]:
             f"on PYTHONPATH, or in the working directory {Path.cwd()}"
             + "".join(f"; not {place}: {reason}" for place, reason in places.items() if reason)
         )
-    if found is None:
+    if function is None:
         file = getattr(sys.modules[module], "__file__", None) or module
         sys.exit(f"{name} cannot be loaded: {file} has no {attribute}")
-    if not callable(found):
+    if not callable(function):
         sys.exit(f"{name} cannot be called: name a function")
-    return found  # type: ignore[no-any-return]
+    return function  # type: ignore[no-any-return]
 
 
 def _explained(error: Exception) -> tuple[str, int | None, str]:
-    """File and line where it was raised, and what it says on one line."""
+    """Return the file and line where an exception was raised, and what it says, on one line."""
     at = traceback.extract_tb(error.__traceback__)[-1]
     return at.filename, at.lineno, " ".join(f"{type(error).__name__}: {error}".split())

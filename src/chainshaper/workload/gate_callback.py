@@ -18,7 +18,7 @@ from chainshaper.workload.traced import TracedPublisher, traced_callback
 def shaper_of(
     gate: GateDescription, origin_phase_ns: int, delivery_core: int | None, turn: Turn | None
 ) -> Shaper:
-    """The shaper of a described gate; its phase and moves count from the run's start."""
+    """Make the shaper of a described gate; its phase and moves count from the run's start."""
     phase_ns = origin_phase_ns if gate.phase_ns is None else gate.phase_ns
     shaper = Shaper(replace(gate.gate(), phase_ns=phase_ns), gate.spin_ns)
     if delivery_core is not None:
@@ -38,14 +38,14 @@ class GateHandles:
 
 
 class GateCallback:
-    """Hold each message until its slot, then publish it.
+    """Holds each message until its slot, then publishes it.
 
-    Between waking and publishing nothing is computed, and after publishing the thread pauses, so
-    that threads it outranks can deliver, unless another message has to leave meanwhile; only then
-    are its events recorded. Delay that no other thread caused is a stall of the machine.
+    Between waking and publishing nothing is computed. After publishing the thread pauses, unless
+    another message has to leave, so that threads that it outranks can deliver; then it records the
+    events. A delay that no other thread has caused is recorded as a stall of the machine.
 
-    A message that comes while another waits for its release waits behind it. The executor has
-    these worked off before it takes the next: a message is recorded as taken when it is its turn.
+    A message that comes while another is held waits behind that one. The executor has such messages
+    worked off before it takes the next. A message is recorded as taken when its turn comes.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class GateCallback:
             self._let_one_pass()
 
     def work_off(self) -> bool:
-        """Hold the messages that came meanwhile, as long as one is due; whether some are left."""
+        """Hold the messages that came meanwhile while one is due; return whether more wait."""
         served = False
         while self._waiting and not (served and self._shaper.nothing_due()):
             self._record_take(self._handles.rmw_subscription, self._waiting[0].about)
@@ -96,7 +96,7 @@ class GateCallback:
                 self._shaper.arrive(message.payload, now_ns, stamp, message)
 
     def _let_one_pass(self) -> None:
-        """Hold the oldest message until its release; record those for which there was no room."""
+        """Hold the oldest message until its release; record those that overflowed meanwhile."""
         self._hold()
         for outcome in self._shaper.overflowed:
             self._record_take(self._handles.rmw_subscription, outcome.message.about)
@@ -104,6 +104,7 @@ class GateCallback:
         self._shaper.overflowed.clear()
 
     def _hold_oldest(self) -> None:
+        """Hold the oldest message until its release, publish it, and record what happened."""
         shaper, publisher = self._shaper, self._publisher
         if (outcome := shaper.hold()) is None:
             return
@@ -136,7 +137,6 @@ class GateCallback:
             "dropped": number_of("dropped", release.dropped),
             "moved": release.moved_ns,
         }
-        self._record_release(
-            outcome.awake_ns,
-            *(ABSENT if fields[name] is None else fields[name] for name in LAYOUT["gate_release"]),
-        )
+        values = [fields[name] for name in LAYOUT["gate_release"]]
+        numbers = [ABSENT if value is None else value for value in values]
+        self._record_release(outcome.awake_ns, *numbers)

@@ -1,12 +1,12 @@
 """Starting processes of the live workload, talking with them, and leaving none behind.
 
-A process and we talk in lines of JSON on pipes, and bytes at the end:
+A launcher and a child talk in lines of JSON on pipes, and bytes at the end:
 
-1. we → process: what it is;
-2. process → us: that it is ready;
-3. we → process: when to start and stop (ns of CLOCK_MONOTONIC);
-4. process → us: one line with the size of its events, then the events;
-5. we → process: an empty line: leave.
+1. launcher → child: what the child is;
+2. child → launcher: that it is ready;
+3. launcher → child: when to start and stop (ns of CLOCK_MONOTONIC);
+4. child → launcher: a line with the size of its events, then the events;
+5. launcher → child: an empty line, after which the child leaves.
 
 Between 3 and 4 neither touches a pipe, so that talking never disturbs what is measured.
 """
@@ -27,37 +27,40 @@ from typing import IO, TYPE_CHECKING, Any, TextIO, TypeVar
 from chainshaper.linux.own_processes import end_in_words, module_command
 from chainshaper.values.errors import OperationError
 
-if TYPE_CHECKING:  # a stall meter is Python alone
+if TYPE_CHECKING:  # a stall meter runs with the standard library alone
     from pydantic import BaseModel
 
 ENOUGH = signal.SIGUSR1  # has a child end its run early, and send what it recorded
-ANSWER_S = 60.0  # a process that is silent for longer, discovery included, hangs
-DYING_S = 2.0  # a process that has closed its pipe ends by then, or talks nonsense
+ANSWER_S = 60.0  # a child that is silent for longer, discovery included, hangs
+DYING_S = 2.0  # how long a child that has closed its pipe may take to end
 Model = TypeVar("Model", bound="BaseModel")
 WORKER_NAME = "executor"  # of a node's threads that execute beside its main one
 
 
 @dataclass(frozen=True)
 class Child:
-    """A process of ours, and what of its output was received and not taken yet."""
+    """A process that the launcher has started."""
 
-    name: str
+    name: str  # in messages
     process: subprocess.Popen[bytes]
-    errors: IO[bytes]
-    received: bytearray = field(default_factory=bytearray, repr=False)
+    errors: IO[bytes]  # its error output
+    received: bytearray = field(default_factory=bytearray, repr=False)  # output not yet taken
 
     @property
     def pid(self) -> int:
         return self.process.pid
 
     def tell(self, **fields: Any) -> None:
-        """Send a line; a process that is gone is noticed by :meth:`hear` or the watch."""
+        """Send a line.
+
+        That the child has ended is no error here: :meth:`hear` or :func:`first_casualty` says it.
+        """
         self._send(json.dumps(fields))
 
     def tell_model(self, model: "BaseModel") -> None:
-        """Send a model, as :meth:`tell` does; what its defaults are stays out.
+        """Send a model, as :meth:`tell` does, without the fields that were not set.
 
-        A validator sees the same fields set at both ends.
+        So validators see the same fields set at both ends.
         """
         self._send(model.model_dump_json(exclude_unset=True))
 
@@ -68,9 +71,9 @@ class Child:
             self.process.stdin.flush()
 
     def hear(self, within_s: float = ANSWER_S) -> dict[str, Any]:
-        """Its next line; ``within_s`` are waited for each part of it.
+        """Receive the child's next line; each part of it may take ``within_s``.
 
-        Raises OperationError: it died instead, or was silent.
+        Raises OperationError: the child has ended, or is silent.
         """
         line = self._take(lambda received: received.find(b"\n") + 1, within_s)
         heard = None
@@ -81,16 +84,16 @@ class Child:
         return heard
 
     def hear_bytes(self, size: int, within_s: float = ANSWER_S) -> bytes:
-        """The bytes that follow a line; raises as :meth:`hear` does."""
+        """Receive the bytes that follow a line. Raises OperationError: as :meth:`hear`."""
         if not size:
             return b""
         return self._take(lambda received: size if len(received) >= size else 0, within_s)
 
     def _take(self, enough: Callable[[bytearray], int], within_s: float) -> bytes:
-        """What has arrived, once ``enough`` says how much of it is to be taken.
+        """Wait until ``enough`` says how many of the received bytes to take, and take them.
 
-        Waiting in `select`, not in `read`: no library's signal handlers make the kernel go on
-        with it, so Ctrl-C always ends the wait.
+        It waits in `select`, which a signal always ends, and so does Ctrl-C. A `read` the kernel
+        would start again where a library has installed signal handlers that ask for it.
         """
         assert self.process.stdout is not None  # noqa: S101 - start_child opens it
         pipe = self.process.stdout.fileno()
@@ -107,7 +110,7 @@ class Child:
         return taken
 
     def obituary(self) -> str:
-        """One sentence about how it died, with the last line of its error output."""
+        """Say in a sentence how the child has ended, with the last line of its error output."""
         try:
             code = self.process.wait(timeout=DYING_S)
         except subprocess.TimeoutExpired:
@@ -127,8 +130,8 @@ def start_child(
 ) -> Child:
     """Start ``python -m module ARGUMENTS`` with pipes to talk to it.
 
-    ``libraries`` are what it needs beyond Python's own. A session of its own keeps Ctrl-C for us:
-    we end children in order, they do not die at random.
+    ``libraries`` are what it imports beyond Python's standard library. It has a session of its own,
+    so that Ctrl-C reaches the launcher only, which ends its children in order.
     """
     errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the child
     try:
@@ -147,12 +150,12 @@ def start_child(
 
 
 def first_casualty(children: Iterable[Child]) -> Child | None:
-    """A child that has ended although it should be running, if there is one."""
+    """Return a child that has ended although it should run; None: all run."""
     return next((child for child in children if child.process.poll() is not None), None)
 
 
 def end_all(children: Iterable[Child], patience_s: float = 2.0) -> None:
-    """End every child: ask, wait, kill; afterwards none is left, whatever happened before."""
+    """End all children: ask them, wait for ``patience_s``, and kill those that are left."""
     children = list(children)
     for child in children:
         child.tell()
@@ -191,7 +194,7 @@ def _receive_line() -> str:
 
 
 def own_output() -> TextIO:
-    """Our end of the launcher's pipe; from now on what is printed goes to the error output."""
+    """Return the pipe to the launcher; from now on what is printed goes to the error output."""
     output = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     sys.stdout = sys.stderr
@@ -199,16 +202,16 @@ def own_output() -> TextIO:
 
 
 def send(output: TextIO, **fields: Any) -> None:
-    """One line to the launcher."""
+    """Send a line to the launcher."""
     output.write(json.dumps(fields) + "\n")
     output.flush()
 
 
 def send_events(output: TextIO, events: bytes, **fields: Any) -> None:
-    """What was recorded, behind a line that says how much it is."""
+    """Send what was recorded, behind a line that says how many bytes it is."""
     send(output, bytes=len(events), **fields)
-    # A process that is frozen while it writes has written a part; without a buffer
-    # (PYTHONUNBUFFERED) no other layer writes the rest.
+    # A process that is frozen while it writes has written a part only. Without a buffer
+    # (PYTHONUNBUFFERED) nothing else writes the rest.
     left = memoryview(events)
     while left:
         left = left[output.buffer.write(left) :]
@@ -216,5 +219,5 @@ def send_events(output: TextIO, events: bytes, **fields: Any) -> None:
 
 
 def wait_for_leave() -> None:
-    """Stay until all are done: a participant that leaves early disturbs the others."""
+    """Wait until the launcher lets this process end: one that leaves early disturbs the others."""
     sys.stdin.readline()

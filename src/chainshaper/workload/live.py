@@ -1,7 +1,8 @@
 """Run a described application live: real processes, real DDS topics, real scheduling.
 
-Threads are allocated as in the paper (section 2.5): executors SCHED_FIFO on their cores, DDS
-threads SCHED_FIFO on another, interference low. All of them end with the run.
+Threads are allocated as in the paper (section 2.5), so that they interfere little: executors under
+SCHED_FIFO on their cores, DDS threads under SCHED_FIFO on another core. All processes end with the
+run.
 """
 
 import math
@@ -59,26 +60,24 @@ Numbers: TypeAlias = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class StartedNodes:
-    """The nodes of a live run while they wait for its start, by full name.
+    """The nodes of a live run while they wait for its start.
 
-    ``start_ns`` (CLOCK_MONOTONIC) is the common start of all timers, ``anchor_ns`` the first expiry
-    of the timer that starts the chain, from which its cycles count. Where servers are in force
-    early, both come some hyper-periods sooner than it says here.
+    Instants are of CLOCK_MONOTONIC. Where servers are in force early, both come some whole
+    hyper-periods sooner than it says here.
     """
 
-    pids: dict[str, int]
-    anchor_ns: int
-    start_ns: int
+    pids: dict[str, int]  # by the node's full name
+    anchor_ns: int  # first expiry of the timer that starts the chain; cycles count from it
+    start_ns: int  # the common start of all timers
 
 
 Enforcement: TypeAlias = Callable[[StartedNodes], AbstractContextManager[object]]
 """Puts reservation servers in force for as long as its context lasts."""
 
-LEAD_NS = 300_000_000
+LEAD_NS = 300_000_000  # from when all nodes are ready to the start of their timers
 ENFORCING_NS = 2_000_000_000  # at most until servers are in force, before the first cycle
-DISCOVERY_NS = 20_000_000_000
-LOOK_NS = 1_000_000_000  # between looks who governs the nodes: they write it down every second
-SHOWN = ("tid", "pid", "comm", "policy", "priority", "cores")  # of a thread, by the kernel
+DISCOVERY_NS = 20_000_000_000  # at most until all nodes have found each other
+LOOK_NS = 1_000_000_000  # between two looks for runs that govern the nodes; they write every second
 SINGLE_THREADED = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # what callbacks compute
 
 
@@ -95,18 +94,18 @@ def run_application(
 ) -> Recording:
     """Run an application for ``cycles`` periods of its chain and record it.
 
-    ``realtime`` None takes SCHED_FIFO where it is permitted; False does without. ``plan`` is
-    stored with the recording. A few cycles before the recorded ones warm the caches and are left
-    out. ``enforcement`` is entered when all nodes stand ready and their threads have their
-    scheduling, and left when the run is over, however it ends, before any node is asked to leave:
+    With ``realtime`` None, SCHED_FIFO is used where it is permitted; with False it is not used.
+    ``plan`` is stored with the recording. A few cycles before the recorded ones warm the caches and
+    are left out. ``enforcement`` is entered when all nodes are ready and their threads have their
+    scheduling. It is left when the run is over, however it ends, before any node is asked to leave:
     a thread whose server is closed could not.
 
     Raises:
         InputError: ``output`` exists.
         PlatformError: a core is missing, DDS does not load.
-        OperationError: a node died, discovery failed, the recording cannot be written. In every
-            case all processes are gone and no recording is left; but where the run was interrupted
-            (KeyboardInterrupt), the whole cycles until then are, which the message says.
+        OperationError: a node died, discovery failed, or the recording cannot be written: then all
+            processes are gone, and no recording is left. Or the run was interrupted
+            (KeyboardInterrupt): then the whole cycles until then are recorded, as the message says.
     """
     output = refuse_existing(output)
     if cycles < 1:
@@ -114,7 +113,64 @@ def run_application(
     check_cores(application.cores())
     permitted = _permitted(realtime)
     realtime = permitted if realtime is None else realtime
-    # What can be pre-empted itself cannot tell a stall from ordinary scheduling.
+    run = _run(application, cycles, realtime=realtime, enforcement=enforcement, progress=progress)
+    tables = event_tables(run.logs, run.timing.record_from_ns)
+    tables |= meter_tables(run.stalls.seen, tables.get("machine_stall"))
+    notes = list(_notes(realtime, permitted, run.memory_locked, run.clock_moved_ns))
+    if run.was_interrupted:
+        tables = dict(events.happened(tables, 0, run.timing.stop_ns))
+        notes.append(f"interrupted: {run.timing.cycles} of {cycles} cycles were recorded")
+    if plan is None:
+        plan, in_force = _plan_of_others(run.governed)
+    else:
+        in_force = InForceInfo(since_ns=run.timing.record_from_ns)
+    info = RecordingInfo(
+        source="live",
+        rmw="cyclonedds",
+        clock_offset_ns=run.clock_offset_ns,
+        command=tuple(command),
+        processes={pid: node for node, pid in run.pids.items()},
+        threads=run.threads,
+        realtime=realtime,
+        notes=tuple(notes),
+        stall_meter=run.stalls.info,
+        chain=application.chain,
+        application=application_as_written(application),
+        plan=plan,
+        in_force=in_force,
+    )
+    recording = write_recording(output, tables, info)
+    if run.was_interrupted:
+        raise OperationError(f"{notes[-1]}; they are in {output}")
+    return recording
+
+
+@dataclass(frozen=True)
+class _FinishedRun:
+    """What is known of a run when all of its processes have ended."""
+
+    pids: dict[str, int]  # of nodes, by their full names
+    logs: list["ProcessLog"]  # of nodes
+    stalls: StallWatch
+    timing: Timing  # as it was in the end
+    was_interrupted: bool
+    threads: tuple[ThreadInfo, ...]
+    governed: tuple[Governed, ...]  # plans that others put in force meanwhile
+    memory_locked: bool  # in all nodes
+    clock_offset_ns: int  # of CLOCK_REALTIME against CLOCK_MONOTONIC, when the run began
+    clock_moved_ns: int  # by how much that changed until the end
+
+
+def _run(
+    application: Application,
+    cycles: int,
+    *,
+    realtime: bool,
+    enforcement: Enforcement | None,
+    progress: Progress,
+) -> _FinishedRun:
+    """Start the nodes, let them run, collect what they recorded, and end them."""
+    # Without real-time priority a meter cannot tell a stall from ordinary scheduling.
     watching = stalls_watched(application.cores(), True) if realtime else nullcontext(StallWatch())
     nodes: dict[str, Child] = {}
     finished = False
@@ -124,9 +180,9 @@ def run_application(
         with watching as stalls:
             memory_locked = _await_ready(nodes.values())
             _allocate_threads(application, nodes, realtime)
-            lead = LEAD_NS if enforcement is None else LEAD_NS + ENFORCING_NS
-            timing = timing_of(application, cycles, time.monotonic_ns() + lead)
-            offset = clock_offset()
+            offset_ns = clock_offset()
+            lead_ns = LEAD_NS if enforcement is None else LEAD_NS + ENFORCING_NS
+            timing = timing_of(application, cycles, time.monotonic_ns() + lead_ns)
             pids = {node_name(name): child.pid for name, child in nodes.items()}
             started = StartedNodes(pids, timing.anchor_ns, timing.start_ns)
             with nullcontext() if enforcement is None else enforcement(started):
@@ -134,48 +190,40 @@ def run_application(
                 for child in nodes.values():
                     child.tell(**asdict(timing))
                 stalls.begin(timing.anchor_ns + _between_releases(application), timing.stop_ns)
-                threads, governed, ended_ns = _watch(nodes, stalls.meters, timing, progress)
-                if ended_ns is not None:
-                    timing = _ended_early(nodes.values(), timing, ended_ns)
+                threads, governed, interrupted_ns = _watch(nodes, stalls.meters, timing, progress)
+                if interrupted_ns is not None:
+                    timing = _ended_early(nodes.values(), timing, interrupted_ns)
             progress(1.0, "collecting events")
             logs = [_read_log(name, child, application) for name, child in nodes.items()]
         finished = True
     finally:
         launcher.end_all(nodes.values(), patience_s=3.0 if finished else 0.0)
-    tables = event_tables(logs, timing.record_from_ns)
-    tables |= meter_tables(stalls.seen, tables.get("machine_stall"))
-    notes = list(_notes(realtime, permitted, memory_locked, clock_offset() - offset))
-    if ended_ns is not None:
-        tables = dict(events.happened(tables, 0, timing.stop_ns))
-        notes.append(f"interrupted: {timing.cycles} of {cycles} cycles were recorded")
-    together = in_force_throughout(governed)
-    in_force = None if plan is None else InForceInfo(since_ns=timing.record_from_ns)
-    if plan is None and together is not None:
-        plan = together.plan
-        in_force = InForceInfo(since_ns=together.since_ns, until_ns=together.until_ns)
-    info = RecordingInfo(
-        source="live",
-        rmw="cyclonedds",
-        clock_offset_ns=offset,
-        command=tuple(command),
-        processes={pid: node for node, pid in pids.items()},
+    return _FinishedRun(
+        pids=pids,
+        logs=logs,
+        stalls=stalls,
+        timing=timing,
+        was_interrupted=interrupted_ns is not None,
         threads=threads,
-        realtime=realtime,
-        notes=tuple(notes),
-        stall_meter=stalls.info,
-        chain=application.chain,
-        application=application_as_written(application),
-        plan=plan,
-        in_force=in_force,
+        governed=governed,
+        memory_locked=memory_locked,
+        clock_offset_ns=offset_ns,
+        clock_moved_ns=clock_offset() - offset_ns,
     )
-    recording = write_recording(output, tables, info)
-    if ended_ns is not None:
-        raise OperationError(f"{notes[-1]}; they are in {output}")
-    return recording
+
+
+def _plan_of_others(
+    governed: Sequence[Governed],
+) -> tuple[dict[str, Any] | None, InForceInfo | None]:
+    """Return the plan that others had in force during a run, and when; None: there was none."""
+    together = in_force_throughout(governed)
+    if together is None:
+        return None, None
+    return together.plan, InForceInfo(since_ns=together.since_ns, until_ns=together.until_ns)
 
 
 def _permitted(wanted: bool | None) -> bool:
-    """Whether SCHED_FIFO is. Raises PlatformError: it is wanted and is not."""
+    """Whether SCHED_FIFO is permitted. Raises PlatformError: it is ``wanted``, and is not."""
     permitted = may_use_fifo()
     if wanted and not permitted:
         raise PlatformError(
@@ -186,20 +234,30 @@ def _permitted(wanted: bool | None) -> bool:
 
 
 def _between_releases(application: Application) -> int:
-    """Where behind the anchor stall meters wake up, and every millisecond then."""
-    gates = (cb.gate for _, cb in application.callbacks() if cb.gate is not None)
-    return far_from([opens for gate in gates for opens, _ in gate.slots] or [0])
+    """Return how long behind the anchor stall meters begin to wake up, far from all releases."""
+    starts = [
+        start
+        for _, callback in application.callbacks()
+        if callback.gate is not None
+        for start, _ in callback.gate.slots
+    ]
+    return far_from(starts or [0])
 
 
 def _sooner(application: Application, cycles: int, timing: Timing) -> Timing:
-    """The same run earlier by the whole hyper-periods of its timers that there is time to spare."""
-    hyper = math.lcm(*(cb.timer_ns for _, cb in application.callbacks() if cb.timer_ns))
-    spare = max(0, timing.start_ns - LEAD_NS - time.monotonic_ns())
-    return timing_of(application, cycles, timing.start_ns - spare // hyper * hyper)
+    """Move a run earlier, by as many whole hyper-periods of its timers as there is time for."""
+    periods = [callback.timer_ns for _, callback in application.callbacks() if callback.timer_ns]
+    hyper_period_ns = math.lcm(*periods)
+    spare_ns = max(0, timing.start_ns - LEAD_NS - time.monotonic_ns())
+    earlier_ns = spare_ns // hyper_period_ns * hyper_period_ns
+    return timing_of(application, cycles, timing.start_ns - earlier_ns)
 
 
 def _ended_early(children: Iterable[Child], timing: Timing, ended_ns: int) -> Timing:
-    """Have the run end now; it stops behind its last whole cycle. Raises OperationError: none."""
+    """Have the run end now; return its timing, which ends with the last whole cycle.
+
+    Raises OperationError: there was none.
+    """
     early = replace(timing, stop_ns=ended_ns)
     if early.cycles < 1:
         raise OperationError("interrupted before one whole cycle: nothing is recorded")
@@ -209,7 +267,10 @@ def _ended_early(children: Iterable[Child], timing: Timing, ended_ns: int) -> Ti
 
 
 def _start_nodes(application: Application, nodes: dict[str, Child], realtime: bool) -> None:
-    """Start a process per node, into ``nodes``, with its name in the arguments that ROS 2 has."""
+    """Start a process for each node, and add it to ``nodes``.
+
+    Its arguments name the node as those of ROS 2 do, so that others recognise it.
+    """
     from chainshaper.workload.dds import closed_domain_configuration, free_domain
 
     domain = free_domain()
@@ -227,7 +288,7 @@ def _start_nodes(application: Application, nodes: dict[str, Child], realtime: bo
 
 
 def _setup_of(application: Application, name: str, domain: int, realtime: bool) -> NodeSetup:
-    """What the process of the node gets before it runs."""
+    """Return what the process of a node gets before it runs."""
     described = [callback for _, callback in application.callbacks()]
     publishers = Counter(topic for callback in described for topic in callback.publishes)
     subscriptions = Counter(topic for callback in described for topic in callback.subscriptions)
@@ -251,7 +312,10 @@ def _setup_of(application: Application, name: str, domain: int, realtime: bool) 
 
 
 def _await_ready(children: Iterable[Child]) -> bool:
-    """Wait until all have found each other; whether all of them could lock their memory."""
+    """Wait until all nodes have found each other; return whether all could lock their memory.
+
+    Raises OperationError: some were not found.
+    """
     answers = [(child, child.hear()) for child in children]
     missing = [f"{child.name}: {text}" for child, answer in answers for text in answer["missing"]]
     if missing:
@@ -287,10 +351,11 @@ def _watch(
     timing: Timing,
     progress: Progress,
 ) -> tuple[tuple[ThreadInfo, ...], tuple[Governed, ...], int | None]:
-    """Wait for the end of the run. Raises OperationError: a process ended before its time.
+    """Wait for the end of the run.
 
-    The threads as they were while it lasted, the plans that others put in force meanwhile
-    (`chainshaper apply`), and when the run was interrupted, if it was (ns).
+    Returns the threads as they were while it lasted, the plans that others put in force meanwhile
+    (`chainshaper apply`), and when the run was interrupted (ns; None: it was not). Raises
+    OperationError: a process ended before its time.
     """
     threads: tuple[ThreadInfo, ...] = ()
     governed: tuple[Governed, ...] = ()
@@ -315,47 +380,65 @@ def _watch(
 
 
 def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[ThreadInfo, ...]:
-    found = [
-        (node_name(name), one) for name, child in nodes.items() for one in node_threads(child.pid)
+    """Return all threads of nodes and stall meters, as they are now."""
+    shown = [
+        _thread_info(thread, node_name(name), thread.role)
+        for name, child in nodes.items()
+        for thread in node_threads(child.pid)
     ]
-    found += [("", one) for child in meters.values() for one in list_threads(child.pid)]
-    return tuple(
-        ThreadInfo(
-            node=node,
-            role=one.role if node else "stall-meter",
-            **{name: getattr(one, name) for name in SHOWN},
-        )
-        for node, one in found
+    shown += [
+        _thread_info(thread, "", "stall-meter")
+        for child in meters.values()
+        for thread in list_threads(child.pid)
+    ]
+    return tuple(shown)
+
+
+def _thread_info(thread: RunningThread, node: str, role: str) -> ThreadInfo:
+    return ThreadInfo(
+        tid=thread.tid,
+        pid=thread.pid,
+        comm=thread.comm,
+        node=node,
+        role=role,
+        policy=thread.policy,
+        priority=thread.priority,
+        cores=thread.cores,
     )
 
 
 def node_threads(pid: int) -> list[RunningThread]:
-    """The threads of a node's process. What a callback's module starts executes nothing, and has
-    its thread's name.
+    """Return the threads of a node's process, with their roles.
+
+    Executors are the main thread and those named `WORKER_NAME`. Threads that a callback's module
+    has started execute nothing; they have the name of the thread that loaded it.
     """
     return [
-        replace(one, role="executor") if one.comm == launcher.WORKER_NAME else one
-        for one in list_threads(pid)
+        replace(thread, role="executor") if thread.comm == launcher.WORKER_NAME else thread
+        for thread in list_threads(pid)
     ]
 
 
 @dataclass(frozen=True)
 class ProcessLog:
-    """What one process recorded: rows of :mod:`~chainshaper.workload.event_log`, and objects."""
+    """What a process has recorded."""
 
     pid: int
-    core: int | None  # the one its executor was pinned to, if it was one
-    rows: bytes
-    objects: tuple[dict[str, Any], ...]
+    core: int | None  # that its executor was pinned to; None: it was not, or to several
+    rows: bytes  # of :mod:`~chainshaper.workload.event_log`
+    objects: tuple[dict[str, Any], ...]  # the events of their creation
     modes: tuple[str, ...] = ()  # that its gate knows
 
     def process(self) -> dict[str, Any]:
-        """What all its events have."""
+        """Return the fields that all events of the process share."""
         return {"pid": self.pid, "cpu": self.core}
 
 
 def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataFrame]:
-    """The event tables of all processes, sorted by time, from ``from_ns`` on, but for objects."""
+    """Return the event tables of all processes, sorted by time.
+
+    They have the events from ``from_ns`` on, and the creation of all objects.
+    """
     parts: dict[str, list[pl.DataFrame]] = {}
     for log in logs:
         rows = np.frombuffer(log.rows, dtype=np.int64).reshape(-1, WIDTH)
@@ -365,13 +448,13 @@ def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataF
             for number, (entry, fields) in enumerate(LAYOUT.items())
             if (columns := rows[rows[:, 0] == number, 1:]).size
         }
-        found = list(logged_tables(entries, log.modes))
-        own = {**log.process(), "tid": log.pid}
-        for name in dict.fromkeys(created["event"] for created in log.objects):
-            created = pl.DataFrame([one | own for one in log.objects if one["event"] == name])
-            found.append((name, typed_table(name, created)))
-        for name, table in found:
+        for name, table in logged_tables(entries, log.modes):
             parts.setdefault(name, []).append(table)
+        main_thread = {**log.process(), "tid": log.pid}
+        for name in dict.fromkeys(created["event"] for created in log.objects):
+            of_event = [created for created in log.objects if created["event"] == name]
+            frame = pl.DataFrame([created | main_thread for created in of_event])
+            parts.setdefault(name, []).append(typed_table(name, frame))
     return {
         name: pl.concat(tables).sort("time", maintain_order=True)
         for name, tables in sorted(parts.items())
@@ -381,8 +464,10 @@ def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataF
 def logged_tables(
     entries: Mapping[str, Mapping[str, npt.NDArray[Any]]], modes: Sequence[str]
 ) -> Iterator[tuple[str, pl.DataFrame]]:
-    """The events that entries of a log stand for, of which :data:`LAYOUT` says the fields: columns
-    by their names, beside time and thread.
+    """Yield the tables of the events for which a log's entries stand, with the events' names.
+
+    ``entries`` has the columns of each kind of entry, by name: time, thread, process, core, and the
+    fields in :data:`LAYOUT`. ``modes`` are the names of the modes, which are numbers there.
     """
     for entry in LAYOUT:
         columns = entries.get(entry, {})
@@ -399,7 +484,7 @@ def logged_tables(
 
 
 def typed_table(name: str, frame: pl.DataFrame, modes: Sequence[str] = ()) -> pl.DataFrame:
-    """An event's table from columns of numbers, which stand for words and nulls as in the log."""
+    """Make an event's table of a frame of numbers, which stand for words and nulls as in a log."""
     types, words = events.column_types(name), {**WORDS, "mode": modes}
     columns = []
     for field in filter(frame.columns.__contains__, types):
@@ -416,26 +501,35 @@ def typed_table(name: str, frame: pl.DataFrame, modes: Sequence[str] = ()) -> pl
 
 
 def _read_log(name: str, child: Child, application: Application) -> ProcessLog:
+    """Receive what a node has recorded."""
     answer = child.hear()
     rows = child.hear_bytes(answer["bytes"])
-    core, *others = {*application.cores_of(name)}
-    unbound = not application.nodes[name].bound
-    modes = [cb.gate.modes for cb in application.nodes[name].callbacks if cb.gate is not None]
-    names = tuple(modes[0].bands) if modes and modes[0] is not None else ()
-    known = None if others or unbound else core
-    return ProcessLog(child.pid, known, rows, tuple(answer["objects"]), names)
+    described = application.nodes[name]
+    cores = set(application.cores_of(name))
+    gates = [callback.gate for callback in described.callbacks if callback.gate is not None]
+    modes = gates[0].modes if gates else None
+    return ProcessLog(
+        child.pid,
+        core=cores.pop() if len(cores) == 1 and described.bound else None,
+        rows=rows,
+        objects=tuple(answer["objects"]),
+        modes=() if modes is None else tuple(modes.bands),
+    )
 
 
 def _notes(
     realtime: bool, permitted: bool, memory_locked: bool, clock_moved_ns: int
 ) -> Iterator[str]:
+    """Yield what may have disturbed the run, in words."""
     if not realtime:
         reason = "SCHED_FIFO was declined" if permitted else "the process may not use SCHED_FIFO"
-        how = f"without real-time scheduling ({reason})"
-        yield f"taken {how}, and without watching for stalls of the machine"
+        yield (
+            f"taken without real-time scheduling ({reason}), and without watching for stalls of"
+            " the machine"
+        )
     if not memory_locked:
         yield "memory was not locked: page faults may have cost time"
     if abs(clock_moved_ns) > 1_000_000:
         yield f"the wall clock moved by {duration_text(clock_moved_ns)} against CLOCK_MONOTONIC"
-    if others := foreign_realtime_processes():
-        yield f"other real-time processes were running: {', '.join(others)}"
+    if foreign := foreign_realtime_processes():
+        yield f"other real-time processes were running: {', '.join(foreign)}"

@@ -1,7 +1,7 @@
-"""One node of the live workload, in a process of its own: ``python -m …node_process``.
+"""A node of the live workload, in a process of its own: ``python -m …node_process``.
 
-It talks with :mod:`chainshaper.workload.live` as :mod:`chainshaper.workload.launcher` says. Every
-page of it is locked into memory: it imports nothing that it does not need.
+It talks with :mod:`chainshaper.workload.live` as :mod:`chainshaper.workload.launcher` says. All its
+pages are locked into memory, so it imports nothing that it does not need.
 """
 
 import os
@@ -31,17 +31,17 @@ NEVER_S = 1e6
 KINDS = ("subscription", "service", "client")  # in the order in which executors look at them
 Body: TypeAlias = Callable[[dds.Message], None]
 Completes: TypeAlias = Callable[[dds.Message], tuple[dds.Message, ...]]
-"""Of a synchroniser: takes a message, returns the set that it completes, or nothing."""
+"""Gives a message to a synchroniser; returns the set that it completes, or nothing."""
 
 
 @dataclass(frozen=True)
 class Endpoint:
     """A publisher or subscription that waits for its counterparts."""
 
-    name: str
+    name: str  # in messages
     entity: dds.Publisher | dds.Subscription
-    expected: int  # counterparts
-    counterparts: str  # what they are called
+    expected: int  # how many counterparts it shall have
+    counterparts: str  # what these are called in messages
 
 
 class NodeProcess:
@@ -99,14 +99,14 @@ class NodeProcess:
         callback: CallbackDescription,
         body_of: Callable[[Completes], Callable[..., None]],
     ) -> None:
-        """Add a callback for each input, of which the one that completes a set does the work."""
+        """Add a callback for each input; the one whose message completes a set does the work."""
         topics, trigger = callback.synchronises, callback.triggered_by
         synchroniser = executor.Synchroniser[dds.Message](
             depths=[self.setup.topics[topic].depth for topic in topics],
             trigger=None if trigger is None else topics.index(trigger),
         )
         for number, topic in enumerate(topics):
-            # As in ROS 2, by which the analysis knows the inputs of one synchroniser.
+            # Named as in ROS 2: by that the analysis knows the inputs of a synchroniser.
             handle = self.log.callback(f"message_filters::{symbol}.{number}")
             body = traced_callback(self.log, handle, body_of(partial(synchroniser.add, number)))
             self._subscribe(handle, topic, body, self.setup.node.exclusive_group(callback))
@@ -114,7 +114,7 @@ class NodeProcess:
     def _work(
         self, index: int, callback: CallbackDescription, publishers: Sequence[TracedPublisher]
     ) -> executor.Work:
-        """What the callback does: call the function that it names, or spend drawn times."""
+        """Return what a callback does before it publishes: call a function, or spend time."""
         if callback.computes is not None:
             function = executor.load_function(callback.computes)
             return executor.computing(callback.computes, function, len(publishers))
@@ -126,7 +126,7 @@ class NodeProcess:
         )
 
     def _rest(self, index: int, afterwards: ExecutionTime | None) -> Callable[[], None]:
-        """What the callback does when it has published: spend drawn times, if it has any."""
+        """Return what a callback does after it has published: spend drawn times, or nothing."""
         if afterwards is None:
             return lambda: None
         times = self._times(afterwards, FIRST_AFTER + index)
@@ -189,7 +189,7 @@ class NodeProcess:
         return TracedPublisher(write, template, handle, rmw_handle, point)
 
     def _note_sends(self, rmw_handle: int) -> executor.Note:
-        """A function that records what became of a publisher's messages, in whichever thread."""
+        """Return a function that records what became of a publisher's messages, in any thread."""
         point = self.log.point("asynchronous_send")
 
         def note(at_ns: int, source_timestamp: int, outcome: str, lasted_ns: int) -> None:
@@ -206,7 +206,7 @@ class NodeProcess:
         shaper = shaper_of(gate, self.setup.origin_phase_ns, self.setup.delivery_core, turn)
         self.shapers.append((shaper, gate))
         subscription = self._subscription(topic, READER_DEPTH)
-        if gate.modes is not None:  # before the messages that it concerns
+        if gate.modes is not None:  # first, so that a mode holds for messages that come with it
             self._follow_modes(gate.modes.topic, shaper)
         handle, depth = self.log.callback(symbol), self.setup.topics[topic].depth
         subscription_handle, rmw_handle = self.log.subscription(handle, topic, depth)
@@ -239,7 +239,7 @@ class NodeProcess:
     # Running ------------------------------------------------------------------------------
 
     def wait_for_counterparts(self, deadline_ns: int) -> list[str]:
-        """Wait until DDS discovery is complete; what is still missing at the deadline."""
+        """Wait until DDS discovery is complete; return what is missing at the deadline."""
         while True:
             missing = [
                 f"{end.name} found {end.entity.matched()} of {end.expected} {end.counterparts}"
@@ -271,9 +271,9 @@ def _body(
     rest: Callable[[], None],
     complete: Completes | None = None,
 ) -> Callable[..., None]:
-    """An ordinary callback: work, publish, and do the rest.
+    """Return an ordinary callback, which works, publishes, and does the rest.
 
-    With ``complete`` it does so only for a message that completes a set, and for that set.
+    With ``complete`` it does so only if its message completes a set, and for the whole set.
     """
 
     def body(message: dds.Message | None = None) -> None:
@@ -291,9 +291,9 @@ def _body(
 
 
 def _turn(output: str) -> Turn | None:
-    """The page by which others know an output, as that of a shaping node, but without standby.
+    """Make the page by which others find the gate of an output; None: another run has it.
 
-    None where there cannot be one, or another run has the same output.
+    It is as that of a shaping node, but without a standby. None, too, where there can be no page.
     """
     with suppress(OSError):
         turn = Turn(f"live{output.replace('/', '.')}", output)

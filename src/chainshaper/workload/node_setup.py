@@ -1,7 +1,7 @@
-"""What the process of a live node gets before it runs, and what it answers.
+"""What the process of a live node gets before it runs.
 
-The launcher sends each as a line of JSON (:mod:`chainshaper.workload.launcher`); the process reads
-it back as the same validated model.
+The launcher sends it as a line of JSON (:mod:`chainshaper.workload.launcher`), which the process
+reads back as the same validated model.
 """
 
 from chainshaper.values.yaml_file import FullName, Part
@@ -9,16 +9,14 @@ from chainshaper.workload.description import NodeDescription, TopicDescription
 
 
 class Counterparts(Part):
-    """How many publishers and subscriptions all nodes together have of one topic."""
+    """How many publishers and subscriptions of a topic all nodes have together."""
 
     publishers: int
     subscriptions: int
 
 
 class NodeSetup(Part):
-    """A node as its process builds it: its part of the application's description, and its place in
-    the run.
-    """
+    """A node's part of the application's description, and its place in the run."""
 
     name: str  # full
     node: NodeDescription

@@ -1,10 +1,10 @@
-"""A described application as a colcon package of C++ nodes, for the ROS 2 that a robot runs.
+"""Write a described application as a colcon package of C++ nodes, for the ROS 2 of a robot.
 
-One program is every node: the launch file starts it once for each, with the node's name; the
-description stands in it as a table (``src/application.hpp``). Messages are
-``sensor_msgs/CompressedImage``, a header with the stamp that callbacks pass on, and bytes. An
-execution time is drawn as :mod:`chainshaper.workload.execution` draws it, from another generator:
-the distribution is the same, the sequence is not.
+All nodes are the same program, which has the description as a table (``src/application.hpp``). The
+launch file starts it once for each node, with the node's name. Messages are
+``sensor_msgs/CompressedImage``: a header with the stamp that callbacks pass on, and bytes.
+Execution times have the distribution of :mod:`chainshaper.workload.execution`, but another random
+generator draws them, so their sequence is another.
 """
 
 import os
@@ -40,11 +40,11 @@ _PROFILE = """  <data_writer profile_name="{}">
     <historyMemoryPolicy>PREALLOCATED_WITH_REALLOC</historyMemoryPolicy>
   </data_writer>
 """
-"""Of a topic's publisher; what it does not name stays as Fast DDS has it for this topic."""
+"""The profile of a topic's publisher. What it does not name is as Fast DDS has it by default."""
 
 
 def generate_package(application: Application, folder: str | Path) -> list[Path]:
-    """Write a colcon package with the application's nodes; its files.
+    """Write a colcon package with the application's nodes; return its files.
 
     The folder's name is the package's. ``colcon build`` builds it and ``ros2 launch NAME
     NAME.launch.py`` starts it (Humble and later).
@@ -73,7 +73,7 @@ def generate_package(application: Application, folder: str | Path) -> list[Path]
 
 
 def _files(application: Application, package: str) -> dict[str, str]:
-    """Paths in the package, and their text."""
+    """Return the files of the package: their texts, by their paths."""
     for name, node in application.nodes.items():
         for number, callback in enumerate(node.callbacks):
             _refuse(application, f"{name}: callback {number}", callback)
@@ -97,7 +97,7 @@ def _files(application: Application, package: str) -> dict[str, str]:
         name = str(path.relative_to(_TEMPLATES)).removesuffix(".in")
         text = path.read_text(encoding="utf-8")
         if path.suffix == ".in":
-            text = re.sub("@([A-Z_]+)@", lambda found: values[found[1]], text)
+            text = re.sub("@([A-Z_]+)@", lambda placeholder: values[placeholder[1]], text)
         files[f"launch/{package}.launch.py" if name == "launch.py" else name] = text
     if topics := sorted({topic for _, topic in publishers}):
         profiles = "".join(map(_PROFILE.format, topics))
@@ -106,7 +106,7 @@ def _files(application: Application, package: str) -> dict[str, str]:
 
 
 def _refuse(application: Application, place: str, callback: CallbackDescription) -> None:
-    """InputError: the callback does what a generated node does not."""
+    """Raise InputError if the callback does what a generated node cannot."""
     announced = application.announced()
     refusals = {
         "gate": callback.gate is not None
@@ -132,58 +132,73 @@ def _refuse(application: Application, place: str, callback: CallbackDescription)
 
 
 def _node(application: Application, name: str) -> str:
-    node, own = application.nodes[name], application.scheduling_of(name)
-    both = [_list([one.core, one.priority]) for one in (own, application.dds_scheduling_of(name))]
-    about = ", ".join([_text(node_name(name)), *both, _list(application.cores_of(name))])
-    callbacks = ",\n    ".join(_callback(application, node, one) for one in node.callbacks)
-    return f"  {{{about}, {{\n    {callbacks}}}}}"
+    node = application.nodes[name]
+    executor, dds = application.scheduling_of(name), application.dds_scheduling_of(name)
+    fields = [
+        _text(node_name(name)),
+        _list([executor.core, executor.priority]),
+        _list([dds.core, dds.priority]),
+        _list(application.cores_of(name)),
+    ]
+    callbacks = [_callback(application, node, callback) for callback in node.callbacks]
+    listed = ",\n    ".join(callbacks)
+    return f"  {{{', '.join(fields)}, {{\n    {listed}}}}}"
 
 
 def _callback(
     application: Application, node: NodeDescription, callback: CallbackDescription
 ) -> str:
-    inputs, outputs = (
-        _list(_topic(application, topic) for topic in topics)
-        for topics in (callback.inputs, callback.publishes)
-    )
     trigger = -1
     if callback.triggered_by is not None:
         trigger = callback.synchronises.index(callback.triggered_by)
-    starts = (callback.timer_ns or 0, callback.phase_ns, inputs, trigger)
-    times = (_execution(callback.execution), _execution(callback.afterwards))
-    alone = "true" if callback.group and not node.exclusive_group(callback) else "false"
-    group = _text(callback.group or "")
-    announces = _list(map(_text, callback.announces))
-    return _list([*starts, *times, outputs, announces, group, alone])
+    is_reentrant = bool(callback.group) and not node.exclusive_group(callback)
+    return _list(
+        [
+            callback.timer_ns or 0,
+            callback.phase_ns,
+            _list(_topic(application, topic) for topic in callback.inputs),
+            trigger,
+            _execution(callback.execution),
+            _execution(callback.afterwards),
+            _list(_topic(application, topic) for topic in callback.publishes),
+            _list(map(_text, callback.announces)),
+            _text(callback.group or ""),
+            "true" if is_reentrant else "false",
+        ]
+    )
 
 
 def _topic(application: Application, name: str) -> str:
-    own = application.topic(name)
-    reliable = "true" if own.reliability == "reliable" else "false"
-    return _list([_text(name), own.depth, reliable, own.lifespan_ns or 0, own.payload])
+    described = application.topic(name)
+    is_reliable = "true" if described.reliability == "reliable" else "false"
+    lifespan_ns = described.lifespan_ns or 0
+    return _list([_text(name), described.depth, is_reliable, lifespan_ns, described.payload])
 
 
-def _execution(own: ExecutionTime | None) -> str:
-    if own is None:
+def _execution(time: ExecutionTime | None) -> str:
+    if time is None:
         return "{Distribution::constant, {}, 1}"
     distributions = {
-        "constant": None if own.constant_ns is None else (own.constant_ns,),
-        "uniform": own.uniform_ns,
-        "normal": own.normal_ns and (*own.normal_ns, *(own.within_ns or ())),
-        "samples": own.samples_ns,
-        "sequence": own.sequence_ns,
+        "constant": None if time.constant_ns is None else (time.constant_ns,),
+        "uniform": time.uniform_ns,
+        "normal": time.normal_ns and (*time.normal_ns, *(time.within_ns or ())),
+        "samples": time.samples_ns,
+        "sequence": time.sequence_ns,
     }
-    kind, values = next((kind, many) for kind, many in distributions.items() if many is not None)
-    return _list([f"Distribution::{kind}", _list(values), own.block])
+    kind, values = next(
+        (kind, values) for kind, values in distributions.items() if values is not None
+    )
+    return _list([f"Distribution::{kind}", _list(values), time.block])
 
 
 def _list(values: Any) -> str:
+    """Return values as a braced list of C++."""
     return f"{{{', '.join(map(str, values))}}}"
 
 
 def _text(text: str) -> str:
-    """A string literal; what could end it, or mean something in it, is written in octal."""
+    """Return a text as a string literal of C++; what could have a meaning there is octal."""
     plain = re.compile(rb"[^A-Za-z0-9/_ -]").sub(
-        lambda found: b"\\%03o" % ord(found[0]), text.encode()
+        lambda character: b"\\%03o" % ord(character[0]), text.encode()
     )
     return f'"{plain.decode()}"'

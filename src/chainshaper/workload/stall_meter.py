@@ -1,12 +1,12 @@
 """The stall meter: a sleeper that notices when the machine itself stood still.
 
-Virtual machines and firmware stop all threads of a core for milliseconds now and then. A thread
-at the highest priority that only sleeps and looks at the clock wakes late exactly then. They run
-at half their pace as well while others keep their hardware busy; then the sleeper's wake-ups,
-which are the same work each time, take it twice as much CPU time.
+Virtual machines and firmware stop all threads of a core for milliseconds now and then. A thread at
+the highest priority that only sleeps and looks at the clock wakes up late exactly then. Virtual
+machines also run at half their pace while others keep the hardware busy. Then a wake-up, which is
+the same work each time, takes twice as much CPU time.
 
-One process per core, ``python -m chainshaper.workload.stall_meter``, speaks the launcher's
-protocol; ``ENOUGH`` ends its watch early.
+There is a process for each core, ``python -m chainshaper.workload.stall_meter``, to which the
+launcher talks (:mod:`chainshaper.workload.launcher`); ``ENOUGH`` ends its watch early.
 """
 
 import os
@@ -27,7 +27,7 @@ from chainshaper.robot.shaper import STALL_NS
 from chainshaper.workload import launcher
 from chainshaper.workload.launcher import ENOUGH, Child
 
-if TYPE_CHECKING:  # a meter is Python alone
+if TYPE_CHECKING:  # a meter runs with the standard library alone
     import polars as pl
 
     from chainshaper.values.recording import StallMeterInfo
@@ -35,11 +35,11 @@ if TYPE_CHECKING:  # a meter is Python alone
 PERIOD_NS = 1_000_000  # a wake-up costs some 20 us on a virtual machine
 PRIORITY = 98  # above everything it watches, so that none of it looks like a stall
 WAKEUPS_PER_PACE = 10
-"""Wake-ups whose CPU time is taken together: reading that clock is a call of the kernel."""
-NO_PACE = -1
+"""The CPU time of so many wake-ups is read at once, since reading that clock is a system call."""
+NO_PACE = -1  # in place of the CPU time: the row is a stall
 ORDINARY = 1_000_000  # so many ordinary wake-ups are enough to know their median
-LONGEST_NS = 7 * 24 * 3600 * 1_000_000_000
-LEAD_NS = 50_000_000
+LONGEST_NS = 7 * 24 * 3600 * 1_000_000_000  # of a watch whose end is not given
+LEAD_NS = 50_000_000  # a watch begins so much later than it is asked to, at least
 
 
 def watch(
@@ -51,10 +51,11 @@ def watch(
 ) -> "tuple[array[int], int, int]":
     """Sleep in steps of ``period_ns`` from ``start_ns`` until ``stop_ns`` or ``enough`` says so.
 
-    Returns what was seen as rows of three, the number of wake-ups, and the median lateness of
-    the ordinary ones (all ns). A row is a stall (when it should have woken, how late it was,
-    NO_PACE) or the pace of some wake-ups (their beginning, how long they lasted, the CPU time of
-    one).
+    Returns rows of three numbers, the number of wake-ups, and the median lateness of ordinary ones
+    (all ns). A row is
+
+    * a stall: when the thread should have woken, how late it was, NO_PACE; or
+    * the pace of some wake-ups: when they began, how long they lasted, the CPU time of one.
     """
     seen, lateness = array("q"), array("q")
     clock, cpu_clock = time.monotonic_ns, time.thread_time_ns
@@ -98,15 +99,15 @@ def main() -> None:
 
 
 def far_from(instants_ns: Iterable[int], period_ns: int = PERIOD_NS) -> int:
-    """Where in its period a meter is to wake up, to be as far as may be from recurring instants.
+    """Return when in its period a meter is to wake up, as far as possible from recurring instants.
 
-    A wake-up delays what is published or delivered then by some 40 us; as most cycles are whole
-    multiples of the period, in every cycle of a run.
+    A wake-up delays what is published or delivered then by some 40 us. Most cycles are whole
+    multiples of the period, so it would do so in every cycle of a run.
 
         >>> far_from([20_100_000, 40_200_000], 1_000_000)
         650000
 
-    0 where there are no such instants.
+    Without such instants it is 0.
     """
     places = sorted({int(instant) % period_ns for instant in instants_ns})
     if not places:
@@ -118,19 +119,19 @@ def far_from(instants_ns: Iterable[int], period_ns: int = PERIOD_NS) -> int:
 
 @dataclass
 class StallWatch:
-    """Meters by core; once the watch is over, what they saw and how it was taken.
+    """The meters of some cores and, when the watch is over, what they saw."""
 
-    ``seen`` has (pid, core, rows of :func:`watch`), ``table`` is `machine_stall`.
-    """
-
-    meters: dict[int, Child] = field(default_factory=dict)
-    seen: list[tuple[int, int, bytes]] = field(default_factory=list)
-    table: "pl.DataFrame | None" = None
+    meters: dict[int, Child] = field(default_factory=dict)  # by core
+    seen: list[tuple[int, int, bytes]] = field(default_factory=list)  # pid, core, rows of `watch`
+    table: "pl.DataFrame | None" = None  # `machine_stall`
     info: "StallMeterInfo | None" = None
     begun: bool = False
 
     def begin(self, start_ns: int = 0, stop_ns: int | None = None) -> int:
-        """Begin to watch at an instant or, as soon as can be, whole periods later; when it is."""
+        """Begin to watch at an instant; return it.
+
+        If it is too soon, or past, that is as few whole periods later as possible.
+        """
         soonest = time.monotonic_ns() + LEAD_NS
         start_ns += max(0, -(-(soonest - start_ns) // PERIOD_NS)) * PERIOD_NS
         for child in self.meters.values():
@@ -139,12 +140,12 @@ class StallWatch:
         return start_ns
 
     def end(self, realtime: bool) -> None:
-        """End the watch."""
+        """End the watch, and collect what the meters saw."""
         if not self.begun:
             self.begin()
         for child in self.meters.values():
             child.process.send_signal(ENOUGH)
-        from chainshaper.values.recording import StallMeterInfo  # takes a while
+        from chainshaper.values.recording import StallMeterInfo  # here: importing takes a while
 
         wakeups, lateness = 0, []
         for core, child in self.meters.items():
@@ -165,10 +166,10 @@ class StallWatch:
 
 @contextmanager
 def stalls_watched(cores: Iterable[int], realtime: bool) -> Iterator[StallWatch]:
-    """Watch cores, above everything else if that is permitted, from when the watch is begun until
-    the context ends.
+    """Watch cores, from when the watch is begun until the context ends.
 
-    Raises OperationError: a meter died.
+    With ``realtime`` the meters have a priority above everything else. Raises OperationError: a
+    meter has ended.
     """
     watch, finished = StallWatch(), False
     try:
@@ -191,9 +192,9 @@ def stalls_watched(cores: Iterable[int], realtime: bool) -> Iterator[StallWatch]
 def measure_stalls(
     cores: Iterable[int], duration_ns: int, realtime: bool
 ) -> "tuple[pl.DataFrame, StallMeterInfo]":
-    """Watch cores for a while: the `machine_stall` table, and how it was taken.
+    """Watch cores for a while; return the `machine_stall` table, and how it was measured.
 
-    Raises OperationError: a meter died.
+    Raises OperationError: a meter has ended.
     """
     with stalls_watched(cores, realtime) as watch:
         watch.begin()
@@ -205,9 +206,10 @@ def measure_stalls(
 def meter_tables(
     seen: Sequence[tuple[int, int, bytes]], seen_by_gates: "pl.DataFrame | None" = None
 ) -> "dict[str, pl.DataFrame]":
-    """`machine_stall` and `machine_pace` from (pid, core, rows of `watch`) per meter.
+    """Make the tables `machine_stall` and `machine_pace` of what meters saw.
 
-    What a gate noticed while it watched the clock is added to the stalls.
+    ``seen`` has, of each meter, its pid, its core, and the rows of :func:`watch`. Stalls that gates
+    noticed while they watched the clock are added.
     """
     import numpy as np
     import polars as pl
@@ -221,9 +223,10 @@ def meter_tables(
         rows.append(frame.with_columns(pid=pl.lit(pid, pl.Int32()), cpu=pl.lit(core, pl.Int32())))
     by_meters = pl.concat(rows, how="diagonal").with_columns(tid=pl.col("pid"))
     is_stall = pl.col("cpu_time") == NO_PACE
+    stalls, paces = by_meters.filter(is_stall), by_meters.filter(~is_stall)
     tables = {
-        name: by_meters.filter(own).select(events.empty(name).columns)
-        for name, own in (("machine_stall", is_stall), ("machine_pace", ~is_stall))
+        "machine_stall": stalls.select(events.empty("machine_stall").columns),
+        "machine_pace": paces.select(events.empty("machine_pace").columns),
     }
     if seen_by_gates is not None:
         tables["machine_stall"] = pl.concat([seen_by_gates, tables["machine_stall"]])

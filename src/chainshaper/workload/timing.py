@@ -28,11 +28,10 @@ class Timing:
 
 
 def timing_of(application: Application, cycles: int, start_ns: int) -> Timing:
-    """Compute the instants of a run of ``cycles`` recorded cycles whose timers start at
-    ``start_ns``.
+    """Compute the instants of a run of ``cycles`` recorded cycles; timers start at ``start_ns``.
 
-    Recording begins just before the first recorded expiry, so that no callback instance is cut in
-    two; the run goes on behind the last cycle until what began in it is complete.
+    Recording begins just before an expiry of the chain's timer, so that no callback instance is cut
+    in two. The run goes on after the last cycle until what began in it is complete.
     """
     _, timer = origin_timer(application)
     period_ns = timer.timer_ns or 0
@@ -40,8 +39,14 @@ def timing_of(application: Application, cycles: int, start_ns: int) -> Timing:
     first_ns = anchor_ns + WARM_UP_CYCLES * period_ns
     end_ns = first_ns + cycles * period_ns
     before_ns = min(1_000_000, period_ns // 10)
-    gates = (cb.gate for _, cb in application.callbacks() if cb.gate is not None)
-    due_cycles = max((gate.gate().due_cycles for gate in gates), default=0)
+    due_cycles = max(
+        (
+            callback.gate.gate().due_cycles
+            for _, callback in application.callbacks()
+            if callback.gate is not None
+        ),
+        default=0,
+    )
     return Timing(
         start_ns=start_ns,
         anchor_ns=anchor_ns,

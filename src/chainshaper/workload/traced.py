@@ -10,19 +10,19 @@ from chainshaper.workload.event_log import EventLog
 
 @dataclass(frozen=True)
 class TracedPublisher:
-    """A publisher with its trace point, which is recorded apart from sending."""
+    """A publisher with its trace point; sending and recording are two calls."""
 
-    write: Callable[[bytes, int], None]  # gets a message and its source timestamp
+    write: Callable[[bytes, int], None]  # takes a message and its source timestamp
     template: bytes  # the data of its messages
     handle: int
     rmw_handle: int
-    point: Callable[..., None]
+    point: Callable[..., None]  # see EventLog.point
 
     def send(self, payload: bytes) -> tuple[int, int]:
         """Publish; return the time of publication (ns) and the source timestamp.
 
-        As the rmw layers do: one time stamp, given to the trace point and to DDS. With
-        asynchronous publication that is when the message was handed over, not when it was sent.
+        Trace point and DDS get the same source timestamp, as from the rmw layers. With asynchronous
+        publication it is when the message was handed over, not when it was sent.
         """
         source_timestamp, now_ns = time.time_ns(), time.monotonic_ns()
         self.write(payload, source_timestamp)
@@ -34,7 +34,7 @@ class TracedPublisher:
 
 
 def traced_callback(log: EventLog, handle: int, body: Callable[..., None]) -> Callable[..., None]:
-    """A callback whose instances are recorded, from start to end."""
+    """Return a callback that calls ``body`` and records its start and end."""
     start, end = log.point("callback_start"), log.point("callback_end")
 
     def callback(*arguments: Any) -> None:

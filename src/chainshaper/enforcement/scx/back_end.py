@@ -1,17 +1,18 @@
 """Back end `scx`: the table of servers inside the kernel, as a sched_ext policy.
 
-While the policy (`policy/table.bpf.c`, compiled ahead) is in force, *every* thread of the machine's
-fair class is scheduled by it. Real-time threads stand above it, so a thread that shall be governed
-must not be one. Nothing has to be put back by hand: the policy hangs on a file descriptor of this
-process, and however it ends, the kernel returns to its fair class. (A fork without exec inherits
-it.)
+While the policy (`policy/table.bpf.c`, compiled ahead) is in force, it schedules *every* thread of
+the machine's fair class. Real-time threads run above it, so threads in servers must not be
+real-time. Nothing has to be put back: the policy lives as long as a file descriptor of this process
+(the loader), so the kernel returns to its fair class however the process ends. (A process that
+forks without exec inherits the descriptor.)
 
-PREEMPT_RT kernels refuse BPF timers. There each core has a **kicker**, a process of its own, since
-a thread of the loader would wait for the interpreter's lock:
+PREEMPT_RT kernels refuse BPF timers. There each core has a **kicker**, which has the policy
+reconsider at each boundary:
 
     python -m chainshaper.enforcement.scx.back_end CORE DESCRIPTOR
 
-Under SCHED_FIFO, of the lowest priority, it sleeps on the core until the next boundary.
+It sleeps on its core until the next boundary, under SCHED_FIFO with the lowest priority. It is a
+process, since a thread of the loader would wait for the interpreter's lock.
 """
 
 import ctypes
@@ -55,7 +56,7 @@ MAX_SERVERS = 128  # with id 0, which means best effort
 MAX_SLOTS = 64
 MAX_SERVERS_PER_CORE = 32
 MAX_CORES = 512
-_VISITOR = 0xFFFFFFFF
+_VISITOR = 0xFFFFFFFF  # server of the thread that starts the timers
 SERVER = struct.Struct("<QQIIII")
 SLOT = struct.Struct("<QQ")
 CORE = struct.Struct(f"<I{MAX_SERVERS_PER_CORE}I")
@@ -68,16 +69,16 @@ INSTANT = struct.Struct("<qq")
 _FLAGS = struct.Struct("<Q")
 
 _FREELY = "the policy is gone, and all threads run freely"
-ROTATION_NS = 2_000_000  # one thread of a server runs so long before the next has its turn
-_WATCH_S = 0.02
-_VISIT_NS = 1_000_000
-_KICKER_ROUND_NS = 60_000_000  # each kicker looks for a new table every 20 ms at least
+ROTATION_NS = 2_000_000  # a thread of a server runs so long before the next one has its turn
+_WATCH_S = 0.02  # between two looks at the kickers
+_VISIT_NS = 1_000_000  # that starting a core's timer may take
+_KICKER_ROUND_NS = 60_000_000  # for all kickers to see a new table: each looks every 20 ms at least
 _FAIR_POLICIES = (os.SCHED_OTHER, os.SCHED_BATCH, os.SCHED_IDLE, 7)
 _CAPABILITIES = {"CAP_IPC_LOCK": 14, "CAP_SYS_ADMIN": 21, "CAP_PERFMON": 38, "CAP_BPF": 39}
 
 
 def missing() -> str | None:
-    """Why sched_ext servers cannot be had here, with the remedy; None when they can."""
+    """Say why there can be no sched_ext servers here, with the remedy; None: there can."""
     if not SCHED_EXT.is_dir():
         return "this kernel has no sched_ext: use Linux 6.12 or newer with CONFIG_SCHED_CLASS_EXT"
     if not KERNEL_TYPES.exists():
@@ -102,7 +103,7 @@ def is_realtime_kernel() -> bool:
 
 
 def scheduler_in_force() -> str | None:
-    """The name of the sched_ext scheduler that is loaded, None when there is none."""
+    """Return the name of the sched_ext scheduler that is loaded; None: there is none."""
     try:
         if read_proc(SCHED_EXT / "state").strip() == b"disabled":
             return None
@@ -112,6 +113,7 @@ def scheduler_in_force() -> str | None:
 
 
 def _lacking_privileges() -> list[str]:
+    """Return the capabilities that this process needs and lacks."""
     (mask,) = status_field(STATUS.read_bytes(), "CapEff", base=16)
     granted = {name for name, bit in _CAPABILITIES.items() if mask >> bit & 1}
     wanted = [] if "CAP_SYS_ADMIN" in granted else ["CAP_BPF", "CAP_PERFMON"]
@@ -140,7 +142,7 @@ def check_table(table: ServerTable) -> None:
 
 
 def _too_many(table: ServerTable) -> list[tuple[str, int, int]]:
-    """Where there are how many servers, and how many there may be."""
+    """Return where there are too many servers: the place in words, how many, and the most."""
     crowds = [("", len(table.servers), MAX_SERVERS - 1)]
     for core, count in Counter(server.core for server in table.servers).items():
         crowds.append((f" on core {core}", count, MAX_SERVERS_PER_CORE))
@@ -148,79 +150,103 @@ def _too_many(table: ServerTable) -> list[tuple[str, int, int]]:
 
 
 def with_places_apart(table: ServerTable) -> ServerTable:
-    """The table with a server for each place, in the order of priorities and places: so the policy
-    runs the most urgent of a server's threads. If it cannot hold so many, the last places are one.
+    """Return a table with a server for each place, so that the most urgent thread runs first.
+
+    The new servers have priorities in the order of the old ones' priorities, then of places. If the
+    policy cannot hold so many, the last places of a server share one.
     """
     for most in range(max((server.places for server in table.servers), default=1), 0, -1):
-        places = [(one, k) for one in table.servers for k in range(min(one.places, most))]
-        ranks = sorted({(one.priority, k) for one, k in places})
-        apart = (
-            replace(one, name=_of_place(one.name, k), priority=1 + ranks.index((one.priority, k)))
-            for one, k in places
-        )
-        found = replace(table, servers=tuple(apart))
-        if not _too_many(found):
+        places = [
+            (server, place) for server in table.servers for place in range(min(server.places, most))
+        ]
+        ranks = sorted({(server.priority, place) for server, place in places})
+        servers = [
+            replace(
+                server,
+                name=_of_place(server.name, place),
+                priority=1 + ranks.index((server.priority, place)),
+            )
+            for server, place in places
+        ]
+        apart = replace(table, servers=tuple(servers))
+        if not _too_many(apart):
             break
-    return found
+    return apart
 
 
 def _of_place(server: str, place: int) -> str:
+    """Return the name of the server for a place of a server."""
     return f"{server}\0{place}" if place else server
 
 
 def numbered(table: ServerTable) -> dict[str, int]:
-    """An id for each server; 0 means best effort."""
+    """Return an id for each server; 0 means best effort."""
     return {server.name: number for number, server in enumerate(table.servers, start=1)}
 
 
 def pack_servers(table: ServerTable) -> dict[int, bytes]:
-    """Map `servers` by id."""
+    """Return the elements of the map `servers`, by their keys: the servers' ids."""
     packed = {}
     for number, server in enumerate(table.servers, start=1):
-        where = (server.core, server.priority, len(server.slots), 0)
-        head = SERVER.pack(table.cycle_ns, ROTATION_NS, *where)
+        head = SERVER.pack(
+            table.cycle_ns, ROTATION_NS, server.core, server.priority, len(server.slots), 0
+        )
         slots = b"".join(SLOT.pack(start, end) for start, end in server.slots)
         packed[number] = (head + slots).ljust(SERVER.size + MAX_SLOTS * SLOT.size, b"\0")
     return packed
 
 
 def pack_cores(table: ServerTable) -> dict[int, bytes]:
-    """Map `cpus`: the ids of a core's servers, best first, equals as in the table."""
+    """Return the elements of the map `cpus`, by core: the ids of the core's servers.
+
+    The most urgent comes first; those of one priority are in the order of the table.
+    """
     ids, packed = numbered(table), {}
     for core in {server.core for server in table.servers}:
-        here = sorted((s for s in table.servers if s.core == core), key=lambda s: s.priority)
+        here = [server for server in table.servers if server.core == core]
+        here.sort(key=lambda server: server.priority)
+        here_ids = [ids[server.name] for server in here]
         padding = [0] * (MAX_SERVERS_PER_CORE - len(here))
-        packed[core] = CORE.pack(len(here), *(ids[server.name] for server in here), *padding)
+        packed[core] = CORE.pack(len(here), *here_ids, *padding)
     return packed
 
 
 def pack_in_force(place: int, anchors: Sequence[int], instant_ns: int, *, replaces: bool) -> bytes:
-    """Map `in_force`: the anchor in this place from the instant on; before, the other, if any."""
+    """Return the element of the map `in_force`: which of two anchors holds, and from when on.
+
+    From the instant on it is the anchor in this place. Before, it is the other one, if there is one
+    that it ``replaces``; else none.
+    """
     return IN_FORCE.pack(instant_ns << 2 | replaces << 1 | place, *anchors)
 
 
 def unpack_counters(value: bytes) -> ServerCounters:
-    """An element of map `counters`."""
+    """Make counters of an element of the map `counters`."""
     return ServerCounters(*COUNTERS.unpack(value)[:4])
 
 
 def in_all_places(counters: Sequence[ServerCounters]) -> ServerCounters:
-    """What a server has done, from what it has in each place: all have the same slots."""
+    """Join the counters of a server's places, which all have the same slots.
+
+    A slot counts as overrun once, however many threads wanted to run at its end.
+    """
     first = counters[0]
-    overruns = min(first.slots or 0, sum(one.overruns or 0 for one in counters))
+    overruns = min(first.slots or 0, sum(of_place.overruns or 0 for of_place in counters))
     return replace(first, overruns=overruns)
 
 
 def unpack_exit(value: bytes) -> str | None:
-    """The element of map `ended`: why the kernel ended the policy, None if it has not."""
+    """Read the element of the map `ended`: why the kernel has ended the policy, or None."""
     kind, *texts = EXIT.unpack(value)
     said = [text.split(b"\0", 1)[0].decode(errors="replace") for text in texts]
     return ": ".join(filter(None, said)) if kind else None
 
 
 def create(table: ServerTable) -> "ScxServers":
-    """Servers for this table; nothing is loaded before :meth:`ScxServers.arm`. Raises InputError:
-    as :func:`check_table`. PlatformError: there is no such core, or as :func:`missing` says.
+    """Make servers for a table; nothing is loaded before :meth:`ScxServers.arm`.
+
+    Raises InputError: as :func:`check_table`. PlatformError: there is no such core, or as
+    :func:`missing` says.
     """
     check_table(table)
     check_cores({server.core: f"server {server.name}" for server in table.servers})
@@ -237,12 +263,13 @@ class ScxServers(BackEnd):
         self._apart = with_places_apart(table)
         self._ids = numbered(self._apart)
         self._cores = sorted({server.core for server in table.servers})
-        self._members: dict[int, tuple[int, int]] = {}  # tid -> (thread descriptor, server id)
+        self._members: dict[int, tuple[int, int]] = {}  # by tid: thread descriptor, server id
         self._has_timer = not is_realtime_kernel()
         self._policy: BpfObject | None = None
         self._link = 0
-        self._kickers: dict[int, subprocess.Popen[bytes]] = {}
-        self._anchors, self._place = [0, 0], 0
+        self._kickers: dict[int, subprocess.Popen[bytes]] = {}  # by core
+        self._anchors = [0, 0]  # the anchor in force, and the one before or after
+        self._place = 0  # of the latest anchor
         self._failure: str | None = None
         self._released = threading.Event()
         self._last_counters = dict.fromkeys(
@@ -251,7 +278,10 @@ class ScxServers(BackEnd):
         self._lock = threading.RLock()
 
     def assign(self, tid: int, server: str, place: int = 0) -> None:
-        """See :meth:`BackEnd.assign`; refused where it is real-time, or may not use the core."""
+        """Put a thread into a server; see :meth:`BackEnd.assign`.
+
+        Raises OperationError: it is real-time, or may not use the server's core.
+        """
         core = server_named(self._table, server).core
         with self._lock:
             self._check_in_use()
@@ -260,15 +290,19 @@ class ScxServers(BackEnd):
                 return
             if tid in self._members:
                 os.close(self._members.pop(tid)[0])
-            places = (_of_place(server, k) for k in range(place, -1, -1))
-            number = next(self._ids[name] for name in places if name in self._ids)
+            # The last places may share a server.
+            names = (_of_place(server, earlier) for earlier in range(place, -1, -1))
+            number = next(self._ids[name] for name in names if name in self._ids)
             self._members[tid] = (descriptor, number)
             if self._policy is not None:
                 self._hand_over(self._policy, tid)
                 self._policy.run("table_decide", WAKE.size)()
 
     def arm(self, anchor_ns: int) -> None:
-        """See :meth:`BackEnd.arm`; returns when the slots are in force, on all cores at once."""
+        """Enforce the slots; see :meth:`BackEnd.arm`. Returns when they are in force.
+
+        That is at the same instant on all cores.
+        """
         with self._lock:
             self._check_in_use()
             if self._policy is None:
@@ -279,16 +313,20 @@ class ScxServers(BackEnd):
             self._since_ns = instant
 
     def counters(self) -> dict[str, ServerCounters]:
-        """See :meth:`BackEnd.counters`; after :meth:`release`, the last ones. A slot opens with the
-        core's first decision inside it, and counts once as overrun, by however many threads.
+        """Return the counters; see :meth:`BackEnd.counters`. After the release, the last ones.
+
+        A slot counts from the core's first decision inside it on.
         """
         with self._lock:
             if self._policy is not None:
                 places: dict[str, list[ServerCounters]] = {}
                 for name, number in self._ids.items():
-                    own = unpack_counters(self._policy.element("counters", number, COUNTERS.size))
-                    places.setdefault(name.partition("\0")[0], []).append(own)
-                self._last_counters = {name: in_all_places(all_) for name, all_ in places.items()}
+                    element = self._policy.element("counters", number, COUNTERS.size)
+                    server = name.partition("\0")[0]
+                    places.setdefault(server, []).append(unpack_counters(element))
+                self._last_counters = {
+                    server: in_all_places(counters) for server, counters in places.items()
+                }
             return dict(self._last_counters)
 
     def failure(self) -> str | None:
@@ -308,13 +346,14 @@ class ScxServers(BackEnd):
             self._members.clear()
 
     def _check_in_use(self) -> None:
+        """Raise OperationError if the servers were released, or have failed."""
         if self._released.is_set():
             raise OperationError("these servers were released; create them anew")
         if (failure := self.failure()) is not None:
             raise OperationError(f"{failure}; release these servers and create them anew")
 
     def _begin(self) -> BpfObject:
-        """The policy, with a table that is not in force yet: everything runs as best effort."""
+        """Load the policy with the table, which is not in force yet: all runs as best effort."""
         try:
             policy = BpfObject(POLICY)
         except OSError as error:
@@ -323,7 +362,8 @@ class ScxServers(BackEnd):
             config = policy.initial_bytes(".rodata.config", CONFIG.size)
             core_count = min(os.sysconf("SC_NPROCESSORS_CONF"), MAX_CORES)
             CONFIG.pack_into(config, 0, self._has_timer, core_count)
-            # Where the kernel has it: threads that must not migrate are ours to place, too.
+            # With this flag the policy places threads that must not migrate, too. Older kernels
+            # do not have it.
             flags = policy.initial_bytes("table_ops", _FLAGS.size)
             wanted = kernel_enum_value("scx_ops_flags", "SCX_OPS_ENQ_MIGRATION_DISABLED") or 0
             _FLAGS.pack_into(flags, 0, _FLAGS.unpack_from(flags)[0] | wanted)
@@ -334,10 +374,11 @@ class ScxServers(BackEnd):
                 policy.update("cpus", core, value)
             for tid in tuple(self._members):
                 self._hand_over(policy, tid)
-            for core in () if self._has_timer else self._cores:
+            if not self._has_timer:
                 boundary = policy.program_descriptor("table_boundary")
-                self._kickers[core] = _start_kicker(core, boundary)
-            if (reason := missing()) is not None:  # another scheduler's, since it was looked for
+                for core in self._cores:
+                    self._kickers[core] = _start_kicker(core, boundary)
+            if (reason := missing()) is not None:  # another scheduler was loaded meanwhile
                 raise OperationError(reason)
             self._link = policy.attach_operations("table_ops")
         except (OperationError, OSError) as error:
@@ -353,13 +394,15 @@ class ScxServers(BackEnd):
         return policy
 
     def _put_in_force(self, policy: BpfObject, anchor_ns: int) -> int:
-        """Write the anchor and have all cores change over; the instant at which they will, a little
-        ahead, for each core to learn of it. Kickers look by themselves. A timer belongs to the core
-        that starts it, so the calling thread goes round; the policy lets it pass before everything
-        else. Raises OperationError: it may not run on one of the cores.
+        """Write the anchor and have all cores change over to it; return the instant of that.
+
+        The instant is so far ahead that each core knows of the anchor by then. Kickers look for it
+        by themselves. A timer belongs to the core on which it is started, so the calling thread
+        runs on one core after the other; the policy runs it before all other threads. Raises
+        OperationError: it may not run on one of the cores.
         """
         place = 1 - self._place
-        self._anchors[place] = anchor_ns % self._table.cycle_ns  # in the past: cycles repeat
+        self._anchors[place] = anchor_ns % self._table.cycle_ns  # the same cycles, from long ago
         start_timer, home = policy.run("table_boundary", WAKE.size), os.sched_getaffinity(0)
         visited = self._cores if self._has_timer else ()
         descriptor = _thread_descriptor(threading.get_native_id())
@@ -385,7 +428,7 @@ class ScxServers(BackEnd):
         return instant
 
     def _hand_over(self, policy: BpfObject, tid: int) -> None:
-        """Give the policy the server of a thread; one that has ended is forgotten."""
+        """Tell the policy the server of a thread; a thread that has ended is forgotten."""
         descriptor, number = self._members[tid]
         try:
             policy.update("assignments", descriptor, number.to_bytes(4, "little"))
@@ -396,23 +439,27 @@ class ScxServers(BackEnd):
             raise OperationError(f"thread {tid} gets no server: {error.strerror}") from error
 
     def _watch(self) -> None:
-        """Fail open when a kicker stops, or watching does: an idle core would never notice."""
+        """Take the policy away when a kicker stops, or watching them fails.
+
+        Without its kicker, an idle core would keep its threads waiting for ever.
+        """
         try:
             self._watch_kickers()
-        except Exception as error:  # a thread that ends in silence watches no more
+        except Exception as error:  # otherwise the thread would end, and nobody would watch
             with self._lock:
-                why = f"watching the kickers has failed ({type(error).__name__}: {error})"
-                self._failure = self._failure or f"{why}; {_FREELY}"
+                reason = f"watching the kickers has failed ({type(error).__name__}: {error})"
+                self._failure = self._failure or f"{reason}; {_FREELY}"
                 self._end()
 
     def _watch_kickers(self) -> None:
+        """Watch the kickers until the servers are released or have failed."""
         while not self._released.wait(_WATCH_S):
             with self._lock:
                 for core, kicker in self._kickers.items():
-                    what = what_happened(kicker)
-                    if self.failure() is None and what is not None:
-                        who = f"the kicker of core {core} (process {kicker.pid})"
-                        self._failure = f"{who} {what}, which makes slots inexact; {_FREELY}"
+                    end = what_happened(kicker)
+                    if self.failure() is None and end is not None:
+                        named = f"the kicker of core {core} (process {kicker.pid})"
+                        self._failure = f"{named} {end}, which makes slots inexact; {_FREELY}"
                 if self.failure() is not None:
                     self._end()
                     return
@@ -435,12 +482,15 @@ class ScxServers(BackEnd):
 
 
 def _thread_descriptor(tid: int) -> int:
-    """A file descriptor that stands for a thread. Raises OSError: there is no such thread."""
+    """Open a file descriptor that stands for a thread. Raises OSError: there is no such thread."""
     return os.pidfd_open(tid, os.O_EXCL)  # PIDFD_THREAD
 
 
 def _examine_thread(tid: int, server: str, core: int) -> int | None:
-    """A descriptor of a thread that the policy can govern on this core; None when it has ended."""
+    """Open a descriptor of a thread that the policy can schedule on this core.
+
+    None: the thread has ended. Raises OperationError: the policy cannot schedule it there.
+    """
     refused = f"thread {tid} cannot be put into server {server}"
     try:
         descriptor = _thread_descriptor(tid)
@@ -461,8 +511,11 @@ def _examine_thread(tid: int, server: str, core: int) -> int | None:
 
 
 def _start_kicker(core: int, program: int) -> subprocess.Popen[bytes]:
-    """Start a core's kicker, with `table_boundary`'s descriptor. Raises OperationError: it ends."""
-    # In its own session, Ctrl-C is for the loader, which ends the kicker last.
+    """Start a core's kicker, which runs ``program``, the descriptor of `table_boundary`.
+
+    Raises OperationError: it ends at once.
+    """
+    # It is in a session of its own, so that Ctrl-C reaches the loader only, which ends it last.
     process = start_module(__name__, str(core), str(program), pass_fds=(program,))
     if not process.stdout or not process.stdout.readline():
         _, said = process.communicate()
@@ -475,7 +528,7 @@ def _kick(core: int, program: int) -> None:
     """Kick the core at each boundary until the loader has gone."""
     loader = os.getppid()
     set_thread_name(f"kicker/{core}")
-    # The class first: moved to a busy core as SCHED_OTHER, it might not run again to ask for it.
+    # The class first: on a busy core it might not run any more as SCHED_OTHER to ask for it.
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     os.sched_setaffinity(0, {core})
     lock_memory()

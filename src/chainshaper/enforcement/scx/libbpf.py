@@ -1,8 +1,9 @@
 """The part of libbpf that a struct_ops policy needs, over ctypes.
 
-libbpf.so.1 comes with every distribution that has BPF at all. An object file is opened, adjusted,
-loaded, and its struct_ops map attached, which gives a link: a file descriptor that the kernel
-closes when the process ends, and takes the policy away. All raise OSError with what libbpf said.
+libbpf.so.1 comes with every distribution that has BPF at all. An object file is opened, adjusted
+and loaded, and its struct_ops map is attached. That gives a link, a file descriptor: when it is
+closed, which the kernel does when the process ends, the policy is gone. All functions raise OSError
+with what libbpf said.
 """
 
 import ctypes
@@ -16,7 +17,7 @@ from chainshaper.values.errors import PlatformError
 
 LIBRARY = "libbpf.so.1"
 _OLDEST = (1, 4)
-"""From here on libbpf tolerates members of sched_ext_ops that the kernel does not know."""
+"""The first version that tolerates members of sched_ext_ops that the kernel does not know."""
 _KIND_ENUM64 = 19
 _BTF_TYPE = struct.Struct("<III")
 _TEST_RUN_OPTIONS = struct.Struct("<QQQIIQQIIIIIIII")
@@ -25,15 +26,15 @@ _messages: list[str] = []  # what libbpf has warned of since the object was open
 
 @functools.cache
 def load_libbpf() -> Any:
-    """The library, with its functions declared. Raises PlatformError: it is absent or too old."""
+    """Load the library and declare its functions. Raises PlatformError: it is absent or too old."""
     remedy = f"install libbpf {_OLDEST[0]}.{_OLDEST[1]} or newer (Debian 13: apt install libbpf1)"
     try:
         library = ctypes.CDLL(LIBRARY, use_errno=True)
     except OSError as error:
         raise PlatformError(f"{LIBRARY} cannot be loaded ({error}): {remedy}") from error
-    found = (library.libbpf_major_version(), library.libbpf_minor_version())
-    if found < _OLDEST:
-        raise PlatformError(f"{LIBRARY} is version {found[0]}.{found[1]}: {remedy}")
+    version = (library.libbpf_major_version(), library.libbpf_minor_version())
+    if version < _OLDEST:
+        raise PlatformError(f"{LIBRARY} is version {version[0]}.{version[1]}: {remedy}")
     pointer, text, number = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int
     for name, result, *arguments in (
         ("bpf_object__open_file", pointer, text, pointer),
@@ -64,6 +65,7 @@ def load_libbpf() -> Any:
 
 
 def _keep_message(level: int, pattern: bytes, arguments: int) -> int:
+    """Keep a warning of libbpf for :func:`_failure`; all other messages are left out."""
     if level == 0:  # a warning
         text = ctypes.create_string_buffer(1 << 20)
         ctypes.CDLL(None).vsnprintf(
@@ -78,6 +80,7 @@ _printer = _PRINTER(_keep_message)
 
 
 def _failure(step: str) -> OSError:
+    """Make an error of the last function's error number, with what libbpf has warned of."""
     number = ctypes.get_errno()
     # The verifier gives its reason at the end of a long log.
     said = "; ".join(message[-400:] for message in _messages[-3:] if message)
@@ -86,7 +89,10 @@ def _failure(step: str) -> OSError:
 
 
 class BpfObject:
-    """An object file: opened, adjusted, loaded. Raises KeyError: it has nothing of a name."""
+    """An object file of BPF programs and maps.
+
+    Methods that take a name raise KeyError: the object has nothing of that name.
+    """
 
     def __init__(self, path: Path) -> None:
         self._library = load_libbpf()
@@ -97,13 +103,13 @@ class BpfObject:
 
     def _find(self, kind: str, name: str) -> int:
         find = getattr(self._library, f"bpf_object__find_{kind}_by_name")
-        found: int | None = find(self._object, name.encode())
-        if not found:
+        address: int | None = find(self._object, name.encode())
+        if not address:
             raise KeyError(f"the object has no {kind} {name}")
-        return found
+        return address
 
     def initial_bytes(self, map_name: str, size: int) -> "ctypes.Array[ctypes.c_char]":
-        """The first ``size`` bytes that a map of constants or operations will have; writable."""
+        """Return the first ``size`` bytes of a map before it is loaded, to be written to."""
         address = self._library.bpf_map__initial_value(
             self._find("map", map_name), ctypes.byref(ctypes.c_size_t())
         )
@@ -120,7 +126,7 @@ class BpfObject:
         return int(self._library.bpf_map__fd(self._find("map", name)))
 
     def run(self, program: str, context_size: int) -> "ProgramRun":
-        """A `SEC("syscall")` program, to be run by calling it."""
+        """Return a `SEC("syscall")` program as a function."""
         return ProgramRun(self.program_descriptor(program), context_size)
 
     def program_descriptor(self, name: str) -> int:
@@ -128,15 +134,15 @@ class BpfObject:
 
     def update(self, map_name: str, key: int, value: bytes) -> None:
         """Write one element of a map with 32-bit keys. Raises OSError: the kernel refuses."""
-        its, number = self.map_descriptor(map_name), ctypes.c_uint32(key)
-        if self._library.bpf_map_update_elem(its, ctypes.byref(number), value, 0):
+        descriptor, number = self.map_descriptor(map_name), ctypes.c_uint32(key)
+        if self._library.bpf_map_update_elem(descriptor, ctypes.byref(number), value, 0):
             raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
 
     def element(self, map_name: str, key: int, size: int) -> bytes:
         """Read one element, of ``size`` bytes. Raises OSError: there is none."""
-        its, number = self.map_descriptor(map_name), ctypes.c_uint32(key)
+        descriptor, number = self.map_descriptor(map_name), ctypes.c_uint32(key)
         value = ctypes.create_string_buffer(size)
-        if self._library.bpf_map_lookup_elem(its, ctypes.byref(number), value):
+        if self._library.bpf_map_lookup_elem(descriptor, ctypes.byref(number), value):
             raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
         return value.raw
 
@@ -146,7 +152,7 @@ class BpfObject:
         self._library.bpf_map_delete_elem(self.map_descriptor(map_name), ctypes.byref(number))
 
     def attach_operations(self, map_name: str) -> int:
-        """Put a struct_ops map in force; the address of its link, for :meth:`detach`."""
+        """Put a struct_ops map in force; return the address of its link, for :meth:`detach`."""
         link: int | None = self._library.bpf_map__attach_struct_ops(self._find("map", map_name))
         if not link:
             raise _failure("attaching")
@@ -163,8 +169,10 @@ class BpfObject:
 
 
 class ProgramRun:
-    """A `SEC("syscall")` program, to be run on the calling core any number of times, where
-    microseconds count by ``function(*arguments)``. It reads and writes ``context``.
+    """A `SEC("syscall")` program, to be run on the calling core any number of times.
+
+    It reads and writes ``context``. ``function(*arguments)`` runs it without a check, which takes
+    less time.
     """
 
     def __init__(self, descriptor: int, context_size: int) -> None:
@@ -185,7 +193,7 @@ class ProgramRun:
 
 
 def kernel_enum_value(enum: str, name: str) -> int | None:
-    """The value of an enumerator of the running kernel, None when it has none of this name."""
+    """Return the value of an enumerator of the running kernel; None: it has none of this name."""
     library = load_libbpf()
     btf = library.btf__load_vmlinux_btf()
     number = library.btf__find_by_name(btf, enum.encode()) if btf else -1
@@ -194,12 +202,12 @@ def kernel_enum_value(enum: str, name: str) -> int | None:
             return None
         address = library.btf__type_by_id(btf, number)
         _, information, _ = _BTF_TYPE.unpack(ctypes.string_at(address, _BTF_TYPE.size))
-        wide = information >> 24 & 0x1F == _KIND_ENUM64
-        member = struct.Struct("<III" if wide else "<II")
+        is_wide = information >> 24 & 0x1F == _KIND_ENUM64
+        member = struct.Struct("<III" if is_wide else "<II")
         members = ctypes.string_at(address + _BTF_TYPE.size, (information & 0xFFFF) * member.size)
-        for text, low, *high in member.iter_unpack(members):
-            if library.btf__name_by_offset(btf, text) == name.encode():
-                return int(low | (high[0] << 32 if wide else 0))
+        for name_offset, low, *high in member.iter_unpack(members):
+            if library.btf__name_by_offset(btf, name_offset) == name.encode():
+                return int(low | (high[0] << 32 if is_wide else 0))
         return None
     finally:
         library.btf__free(btf)

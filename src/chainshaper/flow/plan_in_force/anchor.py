@@ -13,8 +13,9 @@ from chainshaper.enforcement.node_threads import Allocation
 from chainshaper.enforcement.planned_threads import closed_before
 from chainshaper.enforcement.servers import ServerCounters
 from chainshaper.enforcement.undoing import ServerState
-from chainshaper.flow import threads
+from chainshaper.flow import anchoring
 from chainshaper.flow.phase import Phase
+from chainshaper.flow.server_tables import places_in, server_table
 from chainshaper.planning.offsets import LEAD_NS
 from chainshaper.planning.plan import Plan, open_until_done
 from chainshaper.planning.plan_file import plan_values
@@ -44,7 +45,7 @@ class AnchoredPlan:
         self, allocation: Allocation, phase_ns: int | None, progress: Callable[[float], None]
     ) -> list[Phase]:
         """Find from when on slots count; returns where chains begin, if that was measured."""
-        self.given, self.anchor_ns, self.waits_ns, phases = threads.carried_out(
+        self.given, self.anchor_ns, self.waits_ns, phases = anchoring.carried_out(
             self.given, allocation, phase_ns, gated=self.gated, progress=progress
         )
         self.plan = open_until_done(self.given, self.waits_ns)
@@ -70,7 +71,7 @@ class AnchoredPlan:
     def server_states(self) -> tuple[ServerState, ...]:
         """The servers as a run shows them before they have threads."""
         keeper = self.back_end if self.gated else "none: priority only"
-        by_back_end = {server.name for server in threads.server_table(self.plan).servers}
+        by_back_end = {server.name for server in server_table(self.plan).servers}
         return tuple(
             ServerState(
                 name=server.name,
@@ -78,7 +79,7 @@ class AnchoredPlan:
                 priority=server.priority,
                 slots=server.slots,
                 threads=(),
-                places=threads.places_in(server, self.plan.most_urgent_first),
+                places=places_in(server, self.plan.most_urgent_first),
                 kept_by=keeper if server.name in by_back_end else "gate",
                 counters=ServerCounters(),
             )

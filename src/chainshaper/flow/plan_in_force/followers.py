@@ -13,7 +13,7 @@ from chainshaper.enforcement.undoing import ServerState
 from chainshaper.flow.drift import SlotFollower
 from chainshaper.flow.plan_in_force.anchor import AnchoredPlan
 from chainshaper.flow.plan_in_force.report import RunReport
-from chainshaper.flow.threads import server_table
+from chainshaper.flow.server_tables import server_table
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.planning.plan import open_until_done, with_slots_moved
 from chainshaper.values.errors import OperationError

@@ -8,7 +8,7 @@ from itertools import repeat
 
 from chainshaper.enforcement.node_threads import Allocation
 from chainshaper.enforcement.servers import BackEnd
-from chainshaper.flow import threads
+from chainshaper.flow import anchoring
 from chainshaper.flow.drift import TimerTrack
 from chainshaper.flow.phase import DriftWatch
 from chainshaper.flow.plan_in_force.anchor import AnchoredPlan
@@ -30,7 +30,7 @@ class OriginWatches:
         """Watch where chains begin, with one watch for each first executor."""
         plan = anchored.plan
         cores = set(available_cores()) - {server.core for server in plan.servers}
-        origins = threads.first_threads(plan, allocation)
+        origins = anchoring.first_threads(plan, allocation)
         self.identities = [{thread.identity for thread in origin} for origin in origins]
         watches: dict[tuple[int, ...], DriftWatch] = {}
         self.watches = []
@@ -55,7 +55,7 @@ class OriginWatches:
 
     def restarted(self, plan: Plan, allocation: Allocation) -> set[int]:
         """The places of chains whose first node was started again."""
-        origins = threads.first_threads(plan, allocation)
+        origins = anchoring.first_threads(plan, allocation)
         now = [{thread.identity for thread in origin} for origin in origins]
         # An executor that has got another thread was not started again.
         return {

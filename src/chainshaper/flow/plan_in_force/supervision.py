@@ -13,6 +13,7 @@ from chainshaper.enforcement.node_threads import NodeThread, new_and_ended
 from chainshaper.enforcement.scheduling_memory import note_descendants
 from chainshaper.enforcement.servers import BackEnd, ServerCounters
 from chainshaper.enforcement.undoing import RunState, ServerState
+from chainshaper.flow.anchoring import carried_out
 from chainshaper.flow.phase import Phase
 from chainshaper.flow.plan_in_force.anchor import AnchoredPlan
 from chainshaper.flow.plan_in_force.followers import Followers
@@ -26,7 +27,7 @@ from chainshaper.flow.plan_in_force.threads import (
     note_absent,
     note_strangers,
 )
-from chainshaper.flow.threads import carried_out, server_table
+from chainshaper.flow.server_tables import server_table
 from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.plan import open_until_done, with_slots_moved
 from chainshaper.values.durations import duration_text

@@ -12,6 +12,7 @@ import socket
 import sys
 import time
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import rclpy
@@ -219,9 +220,11 @@ class Shaping:
         outcome = self._shaper.hold()
         if outcome is None:
             return
-        if turn is not None and turn.was_bypassed(key):
-            self._readiness.ask_for()
-            return
+        if turn is not None:
+            if turn.was_bypassed(key):
+                self._readiness.ask_for()
+                return
+            outcome = self._in_order(outcome, turn)
         published = stalled = None
         if outcome.release.at_ns is not None:
             try:
@@ -240,6 +243,12 @@ class Shaping:
         self._note(outcome, published, stalled)
         if not self._shaper.queue.waiting:
             gc.collect()  # here is time for it; all that is older is frozen
+
+    def _in_order(self, outcome: Outcome, turn: Turn) -> Outcome:
+        """Drop the message if the standby has published one that waits behind it."""
+        if any(turn.is_overtaken_by(newer.about) for newer in self._shaper.queue.waiting):
+            return replace(outcome, release=outcome.release.dropping("replaced"))
+        return outcome
 
     def _shape_uninformed(self, payload: bytes) -> None:
         self._shape(payload, {})

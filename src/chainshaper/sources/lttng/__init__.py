@@ -73,9 +73,9 @@ rm -rf "$LTTNG_HOME"
 class LttngSession:
     """Records with LTTng: a :class:`~chainshaper.sources.Tracer`.
 
-    ``buffer`` is the size of the ring buffer of each core in bytes (:func:`buffer_size`), ``home``
-    a directory of our own, after whose unique name sessions are called, ``daemon`` the session
-    daemon where we have started it.
+    * ``buffer``: the size of the ring buffer of each core in bytes (:func:`buffer_size`).
+    * ``home``: a directory of our own, after whose unique name sessions are called.
+    * ``daemon``: the session daemon, where we have started it.
     """
 
     def __init__(
@@ -115,9 +115,9 @@ class LttngSession:
             stderr=subprocess.DEVNULL,
             **{**self._apart(), "stdin": subprocess.PIPE},  # ends with us, however that happens
         )
-        found = self._answers()
-        if not found or _hears_one_command_only():
-            self._start_daemon(found)
+        answers = self._answers()
+        if not answers or _hears_one_command_only():
+            self._start_daemon(another=answers)
         try:
             self._ask("list", "--kernel")
             self._kernel = True
@@ -142,8 +142,11 @@ class LttngSession:
         self._look_for_strangers()
         try:
             answer = self._ask("list", self._sessions[-1])
-            kinds = ("discarded_events", "lost_packets")
-            counts = [one.text for kind in kinds for one in answer.iterfind(f".//{{*}}{kind}")]
+            counts = [
+                element.text
+                for kind in ("discarded_events", "lost_packets")
+                for element in answer.iterfind(f".//{{*}}{kind}")
+            ]
             if sum(int(count or 0) for count in counts):
                 self._enlarge()
         except OperationError as error:
@@ -196,7 +199,9 @@ class LttngSession:
             )
         notes = [*info.notes, *self._notes]
         if lost := sum(info.lost.values()):
-            larger = self._buffer * (1 if len(self._sessions) > 1 else _ENLARGED_BY)
+            larger = self._buffer
+            if len(self._sessions) == 1:  # else it was enlarged already
+                larger *= _ENLARGED_BY
             remedy = f"Record again with `--buffer {max(1, larger // MIB)}` (MiB a core)."
             notes.append(f"{lost} events were lost: buffers were too small. {remedy}")
         return tables, info.model_copy(update={"notes": tuple(notes)})
@@ -205,14 +210,14 @@ class LttngSession:
         """What was traced stays beside the tables."""
 
     def _apart(self) -> dict[str, Any]:
-        """How commands run: in a session of their own, since Ctrl-C is ours to react to."""
+        """Return how commands run: in a session of their own, since we react to Ctrl-C."""
         return {"env": self._environment, "stdin": subprocess.DEVNULL, "start_new_session": True}
 
     def _ask(self, *arguments: str) -> ElementTree.Element:
-        """The answer of `lttng ARGUMENTS`. Raises OperationError: it fails; in its own words."""
+        """Return the answer of `lttng ARGUMENTS`. Raises OperationError, in its words: it fails."""
         command = [*self._inside, "lttng", "--no-sessiond", "--mi", "xml", *arguments]
         options = {**self._apart(), "capture_output": True, "timeout": _ANSWER_S}
-        what = f"`{shlex.join(('lttng', *arguments))}`"
+        shown = f"`{shlex.join(('lttng', *arguments))}`"
         try:
             run = subprocess.run(
                 command, encoding="utf-8", errors="replace", check=False, **options
@@ -220,19 +225,20 @@ class LttngSession:
             if run.returncode == 0:
                 return ElementTree.fromstring(run.stdout)  # noqa: S314 - LTTng's own, no stranger's
         except (OSError, subprocess.TimeoutExpired) as error:
-            raise OperationError(f"{what} does not answer: {error}") from None
+            raise OperationError(f"{shown} does not answer: {error}") from None
         except ElementTree.ParseError as error:
-            raise OperationError(f"{what} answers no XML: {error}") from None
-        said = run.stderr.strip().rpartition("\n")[2].removeprefix("Error: ")
-        raise OperationError(f"{what} failed: {said or f'exit code {run.returncode}'}")
+            raise OperationError(f"{shown} answers no XML: {error}") from None
+        problem = run.stderr.strip().rpartition("\n")[2].removeprefix("Error: ")
+        raise OperationError(f"{shown} failed: {problem or f'exit code {run.returncode}'}")
 
     def _answers(self) -> bool:
+        """Return whether a session daemon answers."""
         with suppress(OperationError):
             self._ask("list")
             return True
         return False
 
-    def _start_daemon(self, another: bool) -> None:
+    def _start_daemon(self, *, another: bool) -> None:
         """Start a daemon of ours, with a run directory of its own if there is ``another``."""
         if os.getuid() == 0:  # all other users' is in the home directory anyway
             (self.home / "run").mkdir()
@@ -247,14 +253,15 @@ class LttngSession:
                 "wait for its end, or permit mounting (Docker: `--privileged`)"
             )
         if not is_installed("lttng-sessiond"):
-            missing = "no LTTng session daemon runs, and `lttng-sessiond` is not there"
-            raise PlatformError(f"{missing}: {_PACKAGES}")
-        said, sockets = self.home / "daemon.log", self.home / ".lttng"
+            raise PlatformError(
+                "no LTTng session daemon runs, and `lttng-sessiond` is not there: " + _PACKAGES
+            )
+        log_file, sockets = self.home / "daemon.log", self.home / ".lttng"
         sockets.mkdir()
         for version in range(5, 20):  # applications look for one with their ABI's version
             (sockets / f"lttng-ust-sock-{version}").symlink_to("applications")
         applications = f"--apps-sock={sockets / 'applications'}"
-        with os.fdopen(open_output(said), "wb") as log:
+        with os.fdopen(open_output(log_file), "wb") as log:
             self.daemon = subprocess.Popen(
                 [*self._inside, "lttng-sessiond", "--quiet", applications],
                 stdout=log,
@@ -266,24 +273,24 @@ class LttngSession:
         deadline = time.monotonic() + _START_S
         while not self._answers():
             if self.daemon.poll() is not None or time.monotonic() > deadline:
-                reason = said.read_text(errors="replace").strip().rpartition("\n")[2]
+                reason = log_file.read_text(errors="replace").strip().rpartition("\n")[2]
                 reason = reason or "it says nothing"
                 raise OperationError(f"the LTTng session daemon does not start: {reason}")
             time.sleep(0.05)
 
     def _look_for_strangers(self) -> None:
-        """Note who else runs, if the daemon is not ours and so hears every application.
+        """Note which other processes run, if the daemon is not ours and so traces all of them.
 
-        The command's is what descends from us, or has our mark, as with a parent that is gone.
+        Processes of the command descend from us, or have our mark, if their parent is gone.
         """
         if self.daemon is None:
             parent_of, mark = parents(), f"{MARK}={self._sessions[0]}"
             unrelated = parent_of.keys() - descendants(parent_of, os.getpid())
-            others = {pid for pid in unrelated if not _is_marked(pid, mark, self._users)}
-            self._strangers = (self._strangers | others) - (parent_of.keys() - others)
+            strangers = {pid for pid in unrelated if not _is_marked(pid, mark, self._users)}
+            self._strangers = (self._strangers | strangers) - (parent_of.keys() - strangers)
 
     def _new_session(self) -> str:
-        """Prepare a session with buffers of the present size; its name."""
+        """Prepare a session with buffers of the present size; return its name."""
         number = len(self._sessions) + 1
         name = f"{self.home.name}-{number}"
         answer = self._ask("version")
@@ -340,7 +347,7 @@ def _hears_one_command_only() -> bool:
 def buffer_size(
     wanted: int | None = None, free: int | None = None, cores: int | None = None
 ) -> int:
-    """The ring buffer of each core in bytes, a power of two: what is wanted, as far as possible.
+    """Return the size of each core's ring buffer in bytes, a power of two: as wanted, if possible.
 
     The buffers of all cores get half of the ``free`` bytes of /dev/shm at most.
     """
@@ -352,7 +359,7 @@ def buffer_size(
 
 
 def _is_marked(pid: int, mark: str, users: Collection[int]) -> bool:
-    """Whether a process of these users has the mark: others can read and write it as well."""
+    """Return whether a process of these users has the mark; other users can write it as well."""
     with suppress(OSError), process_folder(pid) as folder:  # else it has ended, or is another's
         marked = mark.encode() in read_proc("environ", folder).split(b"\0")
         return marked and user_in(folder) in users
@@ -362,18 +369,22 @@ def _is_marked(pid: int, mark: str, users: Collection[int]) -> bool:
 def _without_processes(
     strangers: Collection[int], tables: EventTables, info: RecordingInfo
 ) -> tuple[EventTables, RecordingInfo]:
+    """Leave out of tables and their description what processes of others did."""
     traced = (frame["pid"].drop_nulls().unique() for frame in tables.values())
     foreign = sorted({pid for pids in traced for pid in pids} & set(strangers))
     if not foreign:
         return tables, info
-    is_own = ~pl.col("pid").is_in(foreign).fill_null(False)
-    own = {name: frame.filter(is_own) for name, frame in tables.items()}
+    is_ours = ~pl.col("pid").is_in(foreign).fill_null(False)
+    left = {name: frame.filter(is_ours) for name, frame in tables.items()}
     names = ", ".join(f"{pid} {info.processes.get(pid, '')}".strip() for pid in foreign)
     note = f"processes that the command has not started are left out: {names}."
-    counts = {n if n == "sched_switch" else f"ros2:{n}": f.height for n, f in own.items()}
+    counts = {
+        name if name == "sched_switch" else f"ros2:{name}": frame.height
+        for name, frame in left.items()
+    }
     facts = {
         "processes": {pid: name for pid, name in info.processes.items() if pid not in foreign},
         "notes": (*info.notes, note),
         "trace_events": counts,
     }
-    return own, info.model_copy(update=facts)
+    return left, info.model_copy(update=facts)

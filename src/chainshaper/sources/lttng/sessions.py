@@ -32,13 +32,18 @@ _REGISTERED = (
     "rclcpp_service_callback_added",
 )
 _COMPARED = (
-    *("rcl_init", "rcl_node_init", "callback_start", "rmw_publish", "rmw_take"),
-    *("rclcpp_publish", "sched_switch"),
+    "rcl_init",
+    "rcl_node_init",
+    "callback_start",
+    "rmw_publish",
+    "rmw_take",
+    "rclcpp_publish",
+    "sched_switch",
 )
 
 
 def table_name(event: str) -> str | None:
-    """The table that an event belongs to: ``ros2:callback_start`` → ``callback_start``."""
+    """Return the table that an event belongs to: ``ros2:callback_start`` → ``callback_start``."""
     provider, _, name = event.rpartition(":")
     known = name in events.FIELDS or name == CARET_INIT
     # CARET's provider was called `ros2_hook` in its first version.
@@ -46,8 +51,8 @@ def table_name(event: str) -> str | None:
     return name if known and provider in providers else None
 
 
-def one_session(trace: CtfTrace, places: Sequence[Place]) -> dict[Place, Place]:
-    """For each place of user space the first one that belongs to the same session as it.
+def first_of_session(trace: CtfTrace, places: Sequence[Place]) -> dict[Place, Place]:
+    """Return for each place of user space the first place that belongs to the same session.
 
     ``places`` are those of the trace's folders. They belong together where they have a trace's UUID
     in common, none of whose streams runs in both at once, or where one runs what was created in the
@@ -59,38 +64,38 @@ def one_session(trace: CtfTrace, places: Sequence[Place]) -> dict[Place, Place]:
             folders.setdefault(place, []).append(number)
     first = {place: place for place in folders}
     objects = cache(lambda place: _objects(trace, folders[place]))
-    for one, another in combinations(folders, 2):
-        if one[0] != another[0] or first[another] != another:
+    for left, right in combinations(folders, 2):
+        if left[0] != right[0] or first[right] != right:
             continue
-        if _continues(trace, folders[one], folders[another]) or _shares_creation(
-            objects(one), objects(another)
+        if _continues(trace, folders[left], folders[right]) or _shares_creation(
+            objects(left), objects(right)
         ):
-            first[another] = first[one]
+            first[right] = first[left]
     return first
 
 
-def _continues(trace: CtfTrace, one: Sequence[int], another: Sequence[int]) -> bool:
-    """Whether some trace is in both, and none of its streams runs in both at once."""
-    spans = [_spans_of_streams(trace, numbers) for numbers in (one, another)]
-    traces = [{uuid for uuid, _, _ in each} for each in spans]
-    if not traces[0] & traces[1] - {None}:
+def _continues(trace: CtfTrace, left: Sequence[int], right: Sequence[int]) -> bool:
+    """Return whether a trace is in both folders, and none of its streams runs in both at once."""
+    of_left, of_right = (_spans_of_streams(trace, folders) for folders in (left, right))
+    uuids = {uuid for uuid, _, _ in of_left} & {uuid for uuid, _, _ in of_right}
+    if not uuids - {None}:
         return False
-    common = spans[0].keys() & spans[1].keys()
-    return not any(_overlap(spans[0][stream], spans[1][stream]) for stream in common)
+    common = of_left.keys() & of_right.keys()
+    return not any(_overlap(of_left[stream], of_right[stream]) for stream in common)
 
 
 _Span: TypeAlias = tuple[int, int]
 """From and to, in cycles of a trace's clock."""
 
 
-def _overlap(one: _Span, another: _Span) -> bool:
-    return max(one[0], another[0]) < min(one[1], another[1])
+def _overlap(left: _Span, right: _Span) -> bool:
+    return max(left[0], right[0]) < min(left[1], right[1])
 
 
 def _spans_of_streams(
     trace: CtfTrace, folders: Sequence[int]
 ) -> dict[tuple[str | None, str, int], _Span]:
-    """Trace's UUID, domain and stream's instance → when it runs."""
+    """Return trace's UUID, domain and stream's instance → when the stream runs."""
     spans: dict[tuple[str | None, str, int], _Span] = {}
     for stream in trace.streams:
         if stream.folder in folders:
@@ -108,14 +113,15 @@ def _span(packets: pl.DataFrame) -> _Span:
 
 
 class _Objects(NamedTuple):
-    """Callbacks (process, address) that are created, those that run, and nodes with their time."""
+    """The objects of which some folders have events."""
 
-    created: frozenset[tuple[int, int]]
-    running: frozenset[tuple[int, int]]
-    nodes: frozenset[object]
+    created: frozenset[tuple[int, int]]  # callbacks that are created: process and address
+    running: frozenset[tuple[int, int]]  # callbacks that run
+    nodes: frozenset[object]  # that are created: process, handle and time
 
 
 def _objects(trace: CtfTrace, folders: Sequence[int]) -> _Objects:
+    """Return the callbacks and nodes of which some folders have events."""
     frames = _events_of(trace, folders, (*_REGISTERED, "callback_start", "rcl_node_init"))
     created, running = set[tuple[int, int]](), set[tuple[int, int]]()
     nodes = set[object]()
@@ -130,14 +136,14 @@ def _objects(trace: CtfTrace, folders: Sequence[int]) -> _Objects:
     return _Objects(frozenset(created), frozenset(running), frozenset(nodes))
 
 
-def _shares_creation(one: _Objects, another: _Objects) -> bool:
-    """Whether most of what runs without a creation of its own was created in the other one.
+def _shares_creation(left: _Objects, right: _Objects) -> bool:
+    """Return whether most of what runs without being created in its folders was created in others.
 
     CARET writes the creation again in each session, with the time at which it was.
     """
-    if one.nodes & another.nodes:
+    if left.nodes & right.nodes:
         return True
-    for earlier, later in ((one, another), (another, one)):
+    for earlier, later in ((left, right), (right, left)):
         pids = {pid for pid, _ in earlier.created}
         unknown = {pair for pair in later.running - later.created if pair[0] in pids}
         if unknown and 2 * len(unknown & earlier.created) >= len(unknown):
@@ -149,9 +155,9 @@ def refuse_same_events(trace: CtfTrace) -> None:
     """Refuse a trace that has two folders with the same events. Raises InputError: names them."""
     times = {number: _time_of(trace, number) for number in range(len(trace.folders))}
     suspected = [
-        (one, another)
-        for one, another in combinations(range(len(trace.folders)), 2)
-        if _alike(trace, one, another) and _overlap(times[one], times[another])
+        (left, right)
+        for left, right in combinations(range(len(trace.folders)), 2)
+        if _of_same_system(trace, left, right) and _overlap(times[left], times[right])
     ]
     read: dict[int, dict[str, pl.DataFrame]] = {}
     threads: dict[int, frozenset[object]] = {}
@@ -162,26 +168,24 @@ def refuse_same_events(trace: CtfTrace) -> None:
         threads[number] = frozenset(
             pid for frame in read[number].values() for pid in frame["pid"].unique().drop_nulls()
         )
-    for one, another in suspected:
-        kernel = trace.folders[one].env.get("domain") == "kernel"
-        if (kernel or threads[one] & threads[another]) and _same(read[one], read[another]):
-            paths = f"{trace.folders[one].path} and {trace.folders[another].path}"
+    for left, right in suspected:
+        of_kernel = trace.folders[left].env.get("domain") == "kernel"
+        if (of_kernel or threads[left] & threads[right]) and _same(read[left], read[right]):
             raise InputError(
-                f"{paths} hold the same events: two sessions recorded the same processes, or one is"
-                " a copy of the other; give one of the two"
+                f"{trace.folders[left].path} and {trace.folders[right].path} hold the same events:"
+                " two sessions recorded the same processes, or one is a copy of the other; give one"
+                " of the two"
             )
 
 
-def _alike(trace: CtfTrace, one: int, another: int) -> bool:
-    facts = [
-        tuple(trace.folders[number].env.get(name) for name in ("hostname", "domain"))
-        for number in (one, another)
-    ]
-    return facts[0] == facts[1]
+def _of_same_system(trace: CtfTrace, left: int, right: int) -> bool:
+    """Return whether two folders are of one host, and both of its kernel or of user space."""
+    of_left, of_right = trace.folders[left].env, trace.folders[right].env
+    return all(of_left.get(name) == of_right.get(name) for name in ("hostname", "domain"))
 
 
 def _time_of(trace: CtfTrace, folder: int) -> _Span:
-    """From when to when a folder has packets; for ever, where they do not say so."""
+    """Return from when to when a folder has packets; for ever, where they do not say so."""
     packets = [stream.packets for stream in trace.streams if stream.folder == folder]
     if not packets:
         return 0, 0
@@ -192,7 +196,7 @@ def _time_of(trace: CtfTrace, folder: int) -> _Span:
 def _events_of(
     trace: CtfTrace, folders: Sequence[int], names: Iterable[str]
 ) -> Iterator[tuple[str, pl.DataFrame]]:
-    """The tables of some folders, by their names, of events that happened."""
+    """Yield the tables of some folders, behind their names, of events that happened."""
     chosen = tuple(stream for stream in trace.streams if stream.folder in folders)
     full = {name: table_name(name) for name in trace.event_names}
     wanted = [name for name, table in full.items() if table in set(names)]
@@ -202,7 +206,7 @@ def _events_of(
 
 
 def _keyed(frame: pl.DataFrame) -> pl.DataFrame:
-    """An event's times, and a number that tells it from the others of its name."""
+    """Return the times of events, and a number of each that tells it from others of its name."""
     simple = [
         name
         for name, kind in frame.schema.items()
@@ -211,23 +215,22 @@ def _keyed(frame: pl.DataFrame) -> pl.DataFrame:
     return frame.select("time", "pid", key=pl.struct(sorted(simple) or ["time"]).hash())
 
 
-def _same(one: Mapping[str, pl.DataFrame], another: Mapping[str, pl.DataFrame]) -> bool:
-    """Whether of each kind of event most of those in the common time are in both."""
+def _same(left: Mapping[str, pl.DataFrame], right: Mapping[str, pl.DataFrame]) -> bool:
+    """Return whether of each kind of event most of those in the common time are in both."""
     shares = []
-    for name in one.keys() & another.keys():
-        begin = max(int(side[name]["time"][0]) for side in (one, another)) - _SAME_NS
-        end = min(int(side[name]["time"][-1]) for side in (one, another)) + _SAME_NS
-        left, right = (
-            side[name].filter(pl.col("time").is_between(begin, end)) for side in (one, another)
-        )
-        if left.height and right.height:
-            joined = left.join_asof(
-                right.select("time", "key", there=True),
+    for name in left.keys() & right.keys():
+        begin = max(int(side[name]["time"][0]) for side in (left, right)) - _SAME_NS
+        end = min(int(side[name]["time"][-1]) for side in (left, right)) + _SAME_NS
+        within = pl.col("time").is_between(begin, end)
+        in_left, in_right = left[name].filter(within), right[name].filter(within)
+        if in_left.height and in_right.height:
+            joined = in_left.join_asof(
+                in_right.select("time", "key", there=True),
                 on="time",
                 by="key",
                 strategy="nearest",
                 tolerance=_SAME_NS,
                 check_sortedness=False,
             )
-            shares.append(joined["there"].count() / min(left.height, right.height))
+            shares.append(joined["there"].count() / min(in_left.height, in_right.height))
     return bool(shares) and min(shares) >= 0.5

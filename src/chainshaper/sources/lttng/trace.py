@@ -26,7 +26,7 @@ from chainshaper.sources.ctf import tsdl as ctf
 from chainshaper.sources.lttng.sessions import (
     CARET_INIT,
     Place,
-    one_session,
+    first_of_session,
     refuse_same_events,
     table_name,
 )
@@ -43,8 +43,6 @@ from chainshaper.values.events import CREATION
 from chainshaper.values.middleware import rmw_of_threads
 from chainshaper.values.progress import Progress
 from chainshaper.values.recording import Recording, RecordingInfo
-
-"""Gets the share of the work that is done, from 0 to 1, and what is being done."""
 
 _MESSAGES = events_in_group("messages")
 _GROUPS = tuple(events_in_group(group) for group in get_args(EventGroup))
@@ -95,14 +93,16 @@ def open_lttng_trace(paths: Sequence[str | Path], progress: Progress | None = No
 
 
 def _fact(folder: ctf.TraceClass, name: str) -> str:
+    """Return what a folder's metadata says of the machine under a name; "": nothing."""
     return str(folder.env.get(name) or "")
 
 
 class TraceTables(Mapping[str, pl.DataFrame]):
     """The event tables of an open trace that happened, decoded at first use.
 
-    ``counts`` are the events per full name, provider included; ``fields`` what is declared of each;
-    so many packets are ``damaged``.
+    * ``counts``: events per full name, provider included.
+    * ``fields``: table → the fields that are declared for its event.
+    * ``damaged``: so many packets are damaged.
     """
 
     def __init__(self, hosts: Mapping[str, CtfTrace], progress: Progress) -> None:
@@ -125,11 +125,15 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         self._decode(CREATION | {CARET_INIT} | _MESSAGES)
 
     def creation(self) -> events.EventTables:
-        """The tables of the objects' creation, and CARET's `caret_init`; empty ones included."""
-        return {n: t for n, t in self._read.items() if n in CREATION or n == CARET_INIT}
+        """Return the tables of creation, and CARET's `caret_init`; empty ones included."""
+        return {
+            name: table
+            for name, table in self._read.items()
+            if name in CREATION or name == CARET_INIT
+        }
 
     def commands(self) -> dict[int, str]:
-        """Process → what its main thread is called, for all that created objects, or else ran."""
+        """Return process → its main thread's name, of all that created objects, or else ran."""
         tables = [self._read[name] for name in CREATION if name in self._read]
         if not any(self._counted(name) for name in ("rcl_node_init", "rcl_init")):
             tables += [self[name] for name in _WHO_RUNS if name in self]
@@ -137,11 +141,12 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         return {pid: self._names.get(pid, "") for pid in pids}
 
     def thread_names(self) -> set[str]:
+        """Return the names of all threads that are known."""
         switches = events.table(self, "sched_switch", ["next_comm"])
         return {*self._names.values(), *switches["next_comm"].unique().drop_nulls()}
 
     def gid_length(self) -> int:
-        """How long a publisher's gid is declared to be."""
+        """Return how long a publisher's gid is declared to be (bytes); 0: it is not declared."""
         match self.fields.get("rmw_publisher_init", {}).get("gid"):
             case ctf.ArrayType(length=int(length)):
                 return length
@@ -174,7 +179,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         return sum(self.counts[source] for source in self._sources.get(name, ()))
 
     def notes(self) -> Iterator[str]:
-        """What a reader of the tables must know: damage, absent fields, numbers that were moved."""
+        """Yield what a reader of the tables must know: damage, absent fields, moved numbers."""
         yield from self.warnings
         for name in sorted(set(self) & self.fields.keys()):
             missing = [
@@ -186,10 +191,12 @@ class TraceTables(Mapping[str, pl.DataFrame]):
             if missing:
                 fields = f"no usable field {', '.join(missing)}"
                 yield f"the trace's {name} has {fields}: what depends on it cannot be known."
-        for host, by in self._moved.items():
-            if by:
-                moved = f"processes and threads of host {host} have {by} added to their numbers"
-                yield f"{moved}, which another host's processes have as well."
+        for host, added in self._moved.items():
+            if added:
+                yield (
+                    f"processes and threads of host {host} have {added} added to their numbers,"
+                    " which another host's processes have as well."
+                )
         if self._anonymous:
             yield (
                 f"{self._anonymous} events say no process or thread and cannot be used: record "
@@ -197,6 +204,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
             )
 
     def _decode(self, group: frozenset[str]) -> None:
+        """Decode the tables of a group, host by host; at the first time, count all events."""
         parts: dict[str, list[pl.DataFrame]] = {}
         wanted = [full for name in group for full in self._sources.get(name, ())]
         nameless = [full for full in wanted if table_name(full) not in CREATION]
@@ -207,16 +215,17 @@ class TraceTables(Mapping[str, pl.DataFrame]):
                 self._progress((place + share) / len(self._hosts), "decoding events")
 
             report(0.0)
-            found = read_events(trace, wanted, nameless=nameless, counted=first, progress=report)
+            frames = read_events(trace, wanted, nameless=nameless, counted=first, progress=report)
             if first:
-                self._take_stock(host, found)
+                self._take_stock(host, frames)
             if unnamed:
-                self._note_names(host, trace, found)
+                self._note_names(host, trace, frames)
             for name in group:
                 for full in self._sources.get(name, ()):
-                    decoded = found.pop(full)  # let go of what is in no table
+                    decoded = frames.pop(full)  # let go of what is in no table
                     table = _event_table(decoded, name, trace.clock_offset_ns)
-                    self._anonymous += (decoded.height - table.height) * first
+                    if first:
+                        self._anonymous += decoded.height - table.height
                     if moved := self._moved[host]:
                         table = table.with_columns(pl.col("pid", "tid") + moved)
                     parts.setdefault(name, []).append(table)
@@ -227,22 +236,22 @@ class TraceTables(Mapping[str, pl.DataFrame]):
                 table = table.unique(maintain_order=True) if table.height else table
             self._read[name] = table
 
-    def _take_stock(self, host: str, found: Events) -> None:
+    def _take_stock(self, host: str, frames: Events) -> None:
         """Count all events; move numbers that another host has, too."""
-        self.counts.update(found.counts)
-        self.warnings += found.warnings
-        self.damaged += found.damaged
+        self.counts.update(frames.counts)
+        self.warnings += frames.warnings
+        self.damaged += frames.damaged
         self._moved[host] = 0
         if len(self._hosts) > 1:
-            known = [frame for frame in found.values() if frame.schema["pid"].is_integer()]
+            known = [frame for frame in frames.values() if frame.schema["pid"].is_integer()]
             pids = {pid for frame in known for pid in frame["pid"].unique().drop_nulls()}
             if pids & self._pids:
                 self._moved[host] = max(self._moved.values()) + NEXT_HOST
             self._pids |= pids
 
-    def _note_names(self, host: str, trace: CtfTrace, found: Events) -> None:
-        """What processes are called, from their objects' creation if it was traced."""
-        names = _process_names(found)
+    def _note_names(self, host: str, trace: CtfTrace, frames: Events) -> None:
+        """Note what processes are called, by their objects' creation if it was traced."""
+        names = _process_names(frames)
         if not names and not any(name in self for name in CREATION):
             ran = [full for name in _WHO_RUNS for full in self._sources.get(name, ())]
             names = _process_names(read_events(trace, ran))
@@ -250,32 +259,34 @@ class TraceTables(Mapping[str, pl.DataFrame]):
 
 
 def _by_host(trace: CtfTrace, paths: Sequence[str | Path]) -> dict[str, CtfTrace]:
-    """The trace in parts, one per traced host, or path of one; the first has foreign kernels'."""
-    kernel = [folder.env.get("domain") == "kernel" for folder in trace.folders]
+    """Return the trace in parts, by traced host, or path of one; the first has foreign kernels'."""
+    of_kernel = [folder.env.get("domain") == "kernel" for folder in trace.folders]
     places: list[Place] = [
         (_fact(folder, "hostname"), next(p for p in paths if folder.path.is_relative_to(p)))
         for folder in trace.folders
     ]
-    session = one_session(trace, places)
+    session = first_of_session(trace, places)
     places = [session.get(place, place) for place in places]
-    user = {place for place, of_kernel in zip(places, kernel, strict=True) if not of_kernel}
+    user = {place for place, kernel in zip(places, of_kernel, strict=True) if not kernel}
     several = Counter(host for host, _ in user)
     hosts = [
         f"{host} in {path}" if several[host] > 1 and (host, path) in user else host
         for host, path in places
     ]
-    traced = list(dict.fromkeys(h for h, k in zip(hosts, kernel, strict=True) if not k))
+    of_user = (host for host, kernel in zip(hosts, of_kernel, strict=True) if not kernel)
+    traced = list(dict.fromkeys(of_user))
     if len(traced) < 2:
         return {"": trace}
     owners = [host if host in traced else traced[0] for host in hosts]
-    return {
-        host: replace(trace, streams=tuple(s for s in trace.streams if owners[s.folder] == host))
-        for host in traced
-    }
+    parts = {}
+    for host in traced:
+        streams = tuple(stream for stream in trace.streams if owners[stream.folder] == host)
+        parts[host] = replace(trace, streams=streams)
+    return parts
 
 
 def _process_names(frames: Mapping[str, pl.DataFrame]) -> dict[int, str]:
-    """Process → name of its main thread, or of any thread where that was not seen."""
+    """Return process → name of its main thread, or of any thread where that was not seen."""
     names: dict[int, str] = {}
     for frame in frames.values():
         numbers = all(frame.schema[column].is_integer() for column in ("pid", "tid"))
@@ -288,19 +299,19 @@ def _process_names(frames: Mapping[str, pl.DataFrame]) -> dict[int, str]:
 
 
 def _declared_fields(trace: CtfTrace) -> dict[str, dict[str, ctf.Type]]:
-    """Table → the fields that the trace declares for its event."""
+    """Return table → the fields that the trace declares for its event."""
     declared: dict[str, dict[str, ctf.Type]] = {}
     streams = [stream for folder in trace.folders for stream in folder.streams.values()]
     for event in (event for stream in streams for event in stream.events.values()):
         if (name := table_name(event.name)) is not None:
             fields = event.fields.fields if event.fields is not None else ()
-            types = {ctf.field_name(one.name): one.type for one in fields}
+            types = {ctf.field_name(field.name): field.type for field in fields}
             declared.setdefault(name, {}).update(types)
     return declared
 
 
 def _decoded_type(declared: ctf.Type | None) -> pl.DataType | None:
-    """What the values of a declared field become, of the kinds that a table has."""
+    """Return what the values of a declared field become; None: a kind that no table has."""
     match declared:
         case ctf.IntegerType():
             return pl.Int64()
@@ -312,7 +323,7 @@ def _decoded_type(declared: ctf.Type | None) -> pl.DataType | None:
 
 
 def _event_table(frame: pl.DataFrame, name: str, clock_offset_ns: int) -> pl.DataFrame:
-    """A decoded event's frame as an event table, without events of no known thread."""
+    """Return a decoded event's frame as an event table, without events of no known thread."""
     if "init_timestamp" in frame.columns and frame.schema["init_timestamp"].is_integer():
         happened = pl.col("init_timestamp")
         wall_clock = happened > clock_offset_ns

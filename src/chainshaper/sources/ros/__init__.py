@@ -1,11 +1,11 @@
 """Asking an application's own ROS 2 while it runs, by a script of ours (:mod:`.script`).
 
 The Python that has `rclpy` is seldom ours, and domain and RMW are those of the application's nodes.
-An environment says which programs and libraries are loaded: who wrote it chooses what runs. So only
-here something is run that was found through another process, with that process's user's rights,
-without capabilities or a way to get any, in that environment and a session of its own, with no
-files of ours but the script and what it may print into, for a limited time, or not at all. What it
-prints is a stranger's word.
+An environment says which programs and libraries are loaded: whoever wrote it chooses what runs. So
+here alone something is run that was found through another process: with the rights of that
+process's user, without capabilities or a way to get any, in that environment and a session of its
+own, with no files of ours but the script and the files that it may print into, and for a limited
+time. What it prints is not trusted.
 """
 
 import ctypes
@@ -64,17 +64,21 @@ class Environment:
 
 @dataclass(frozen=True)
 class Script:
-    """A script that runs, with the files of what it has ``printed`` and ``said`` on its errors."""
+    """A script that runs, and files in memory into which it writes (descriptors)."""
 
     process: "subprocess.Popen[bytes]"
-    printed: int
-    said: int
+    output: int  # what it prints
+    errors: int  # what it prints about errors
 
     def is_over(self) -> bool:
+        """Return whether it has ended."""
         return self.process.poll() is not None
 
     def end(self, within_s: float = 0.0) -> tuple[str, str | None]:
-        """Wait for its end, once, or end its group; what it printed, and why it failed, if so."""
+        """Wait for its end, or end its group; return what it printed, and why it failed, if so.
+
+        To be called once.
+        """
         problem = None
         try:
             code = self.process.wait(within_s)
@@ -82,14 +86,14 @@ class Script:
             problem = f"ROS 2 did not answer within {within_s:g} s"
             os.killpg(self.process.pid, signal.SIGKILL)  # it has not been waited for: still its id
             code = self.process.wait()
-        printed, said = _content(self.printed), _content(self.said)
+        output, errors = _content(self.output), _content(self.errors)
         if problem is None and code != 0:
-            problem = said.strip().rpartition("\n")[2] or f"the script ended with code {code}"
-        return ("" if problem else printed), problem
+            problem = errors.strip().rpartition("\n")[2] or f"the script ended with code {code}"
+        return ("" if problem else output), problem
 
 
 def environment_of(pid: int) -> Environment:
-    """The environment of a process, as it has it now.
+    """Return the environment of a process, as it is now.
 
     Raises OperationError: it has ended, may not be read, is no single user's, or in a container.
     """
@@ -106,27 +110,31 @@ def environment_of(pid: int) -> Environment:
             )
             same = user_in(folder) == user  # nor has it become another program meanwhile
     except OSError as error:
-        what = f"the environment of process {pid}"
-        raise OperationError(f"{what} cannot be read: {error.strerror}") from error
+        raise OperationError(
+            f"the environment of process {pid} cannot be read: {error.strerror}"
+        ) from error
     unused = "so nothing that its environment names is run"
     if user is None or not same:
         raise OperationError(f"process {pid} was started by another user than runs it, {unused}")
     if elsewhere:
-        where = f"process {pid} is in a container or a namespace of its own"
-        raise OperationError(f"{where}, {unused} here: run chainshaper in there")
+        raise OperationError(
+            f"process {pid} is in a container or a namespace of its own, {unused} here: run"
+            " chainshaper in there"
+        )
     _becoming(user)
     pairs = (entry.partition("=") for entry in content.split("\0") if "=" in entry)
     return Environment({name: value for name, _, value in pairs if name}, user)
 
 
 def own_environment() -> Environment:
+    """Return our own environment."""
     return Environment(dict(os.environ), os.geteuid())
 
 
 def run_with_rclpy(
     environment: Environment, script: str, *arguments: str, within_s: float
 ) -> tuple[str, str | None]:
-    """Run a script file in an environment; what it printed, and why it failed, if it did."""
+    """Run a script file in an environment; return its output, and why it failed, if it did."""
     try:
         return start_with_rclpy(environment, script, *arguments).end(within_s)
     except OperationError as error:
@@ -136,13 +144,15 @@ def run_with_rclpy(
 def start_with_rclpy(
     environment: Environment, script: str, *arguments: str, pass_fds: Sequence[int] = ()
 ) -> Script:
-    """Start a script file in an environment, as the user whose it is; it keeps ``pass_fds`` open.
+    """Start a script file in an environment, as its user; it keeps ``pass_fds`` open.
 
     Raises OperationError: we may not become that user, or nothing can be started.
     """
     as_user = _becoming(environment.user)
-    variables = {n: text for n, text in environment.variables.items() if n not in _NOT_FOR_US}
-    printed, said = _bounded_file(), _bounded_file()
+    variables = {
+        name: text for name, text in environment.variables.items() if name not in _NOT_FOR_US
+    }
+    output, errors = _bounded_file(), _bounded_file()
     try:
         with Path(script).open("rb") as source:  # that user may not reach the file itself
             process = subprocess.Popen(
@@ -150,30 +160,37 @@ def start_with_rclpy(
                 env=variables,
                 cwd="/",
                 stdin=source,
-                stdout=printed,
-                stderr=said,
+                stdout=output,
+                stderr=errors,
                 start_new_session=True,
                 pass_fds=pass_fds,
                 preexec_fn=partial(_confine, os.getpid()),  # noqa: PLW1509 - a few system calls
                 **as_user,
             )
     except OSError as error:
-        os.close(printed)
-        os.close(said)
-        what = f"no script of user {user_name(environment.user)}"
-        raise OperationError(f"{what} can be started: {error.strerror}") from error
-    return Script(process, printed, said)
+        os.close(output)
+        os.close(errors)
+        user = user_name(environment.user)
+        raise OperationError(
+            f"no script of user {user} can be started: {error.strerror}"
+        ) from error
+    return Script(process, output, errors)
 
 
 def _becoming(user: int) -> dict[str, Any]:
-    """What has `subprocess` start a process as a user with its groups; nothing if we are that."""
+    """Return what has `subprocess` start a process as a user; nothing if that is who we are.
+
+    Raises OperationError: there is no such user, or we may not become it.
+    """
     if user == os.geteuid():
         return {}
     try:
         known = pwd.getpwuid(user)
     except KeyError:
-        who = f"user {user} of the application is not in this machine's user database"
-        raise OperationError(f"{who}: nothing is run as it") from None
+        raise OperationError(
+            f"user {user} of the application is not in this machine's user database: nothing is run"
+            " as it"
+        ) from None
     if os.geteuid() != 0:
         raise OperationError(
             f"the application is user {known.pw_name}'s, and what its environment names is run by "
@@ -194,7 +211,7 @@ def _confine(parent: int) -> None:
 
 
 def _bounded_file() -> int:
-    """A file in memory that cannot grow beyond :data:`_MOST_PRINTED`."""
+    """Open a file in memory that cannot grow beyond :data:`_MOST_PRINTED`."""
     descriptor = os.memfd_create("chainshaper", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     os.ftruncate(descriptor, _MOST_PRINTED)
     fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_GROW | fcntl.F_SEAL_SHRINK)
@@ -202,7 +219,7 @@ def _bounded_file() -> int:
 
 
 def _content(descriptor: int) -> str:
-    """What was written into such a file, which is closed."""
+    """Return what was written into such a file, and close it."""
     content = os.pread(descriptor, _MOST_PRINTED, 0)
     with suppress(OSError):
         os.close(descriptor)
@@ -210,20 +227,25 @@ def _content(descriptor: int) -> str:
 
 
 def ask_graph(environment: Environment) -> tuple[tuple[EndpointInfo, ...], str | None]:
-    """All endpoints of the ROS graph of a node with this environment, and why there are none.
+    """Return all endpoints in the ROS graph of a node with this environment, or why there are none.
 
     DDS without its security plug-ins does not prove who is in the graph: the answer is bounded and
     checked in its form, and believed in names, types and QoS only.
     """
-    asked = (ros_script.__file__, "graph", str(_PATIENCE_S))
-    said, problem = run_with_rclpy(environment, *asked, within_s=_PATIENCE_S + _START_S)
+    answer, problem = run_with_rclpy(
+        environment,
+        ros_script.__file__,
+        "graph",
+        str(_PATIENCE_S),
+        within_s=_PATIENCE_S + _START_S,
+    )
     if problem is not None:
         return (), problem
     try:
         # Libraries may have printed something before.
-        found = json.loads(said[said.index('{"endpoints"') :])["endpoints"]
-        endpoints = (EndpointInfo.model_validate(one) for one in found)
-        return tuple(one for one in endpoints if _is_ros(one)), None
+        listed = json.loads(answer[answer.index('{"endpoints"') :])["endpoints"]
+        endpoints = (EndpointInfo.model_validate(endpoint) for endpoint in listed)
+        return tuple(endpoint for endpoint in endpoints if _is_ros(endpoint)), None
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         return (), str(error)
 
@@ -232,16 +254,19 @@ def ask_graph(environment: Environment) -> tuple[tuple[EndpointInfo, ...], str |
 def publishing_diagnostics(
     environment: Environment,
 ) -> Iterator[Callable[[Sequence[Mapping[str, Any]]], str | None]]:
-    """A function that has a node in this environment publish statuses on `/diagnostics`.
+    """Start a node in this environment that publishes statuses, until the context ends.
 
-    They have ``name``, ``level``, ``message``, ``values``; it returns why they are not published,
-    once. Raises OperationError: as :func:`start_with_rclpy`.
+    Yields a function that has it publish statuses on `/diagnostics`, each with ``name``, ``level``,
+    ``message`` and ``values``; the function returns, once, why they are not published.
+
+    Raises OperationError: as :func:`start_with_rclpy`.
     """
     reading, writing = os.pipe()
-    os.set_blocking(writing, False)  # a node that does not read must not stop who watches
+    os.set_blocking(writing, False)  # a node that does not read must not stop the watch
     try:
-        asked = (ros_script.__file__, "diagnostics", str(reading))
-        script = start_with_rclpy(environment, *asked, pass_fds=(reading,))
+        script = start_with_rclpy(
+            environment, ros_script.__file__, "diagnostics", str(reading), pass_fds=(reading,)
+        )
     finally:
         os.close(reading)
     over = False
@@ -267,8 +292,10 @@ def publishing_diagnostics(
             script.end(_START_S)
 
 
-def _is_ros(one: EndpointInfo) -> bool:
-    """Whether an endpoint's names and numbers are such as ROS 2 has; others are no endpoints."""
-    values = one.model_dump(exclude_none=True).values()
-    names = all(_NAME.fullmatch(name) for name in (one.node, one.topic, one.type) if name)
-    return names and all(value < _LARGEST for value in values if isinstance(value, int))
+def _is_ros(endpoint: EndpointInfo) -> bool:
+    """Return whether an endpoint's names and numbers are such as ROS 2 has."""
+    values = endpoint.model_dump(exclude_none=True).values()
+    names = (endpoint.node, endpoint.topic, endpoint.type)
+    if not all(_NAME.fullmatch(name) for name in names if name):
+        return False
+    return all(value < _LARGEST for value in values if isinstance(value, int))

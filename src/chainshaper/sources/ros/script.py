@@ -12,9 +12,9 @@ type and QoS. Discovery is over when nothing new has appeared for two seconds, o
 (10). Durations are ns; null where the application set none, or the RMW does not tell.
 
 `parameter` sets an integer parameter. It ends with an error that names each node which has no such
-parameter, refuses the value, or does not answer within five seconds. Who answers is whoever offers
-the service under the node's name. Where several offer it (rclpy counts them since Jazzy), an answer
-says nothing, and that is an error.
+parameter, refuses the value, or does not answer within five seconds. The answer comes from whoever
+offers the service under the node's name. Where several offer it (rclpy counts them since Jazzy), an
+answer says nothing, and that is an error.
 
 `diagnostics` publishes each line that it reads from DESCRIPTOR on `/diagnostics`, until that ends:
 a JSON list of objects with ``name``, ``level`` (0: OK, 1: WARN, 2: ERROR), ``message``, ``values``.
@@ -53,6 +53,7 @@ def node_named(name: str) -> "Iterator[tuple[Any, Any]]":
 
 
 def publish_diagnostics(descriptor: int) -> None:
+    """Publish the statuses of each line that is read, until there are no more."""
     messages = importlib.import_module("diagnostic_msgs.msg")
     kind = messages.DiagnosticStatus
     with node_named(WATCHER) as (_, node), open(descriptor, encoding="utf-8") as lines:
@@ -61,36 +62,40 @@ def publish_diagnostics(descriptor: int) -> None:
             array = messages.DiagnosticArray()
             array.header.stamp = node.get_clock().now().to_msg()
             try:
-                found = json.loads(line)
+                statuses = json.loads(line)
             except ValueError:  # a pipe that was full took a part of it
                 continue
-            for one in found:
-                status = kind(name=one["name"], message=one["message"], hardware_id="chainshaper")
-                status.level = (kind.OK, kind.WARN, kind.ERROR)[one["level"]]
-                values = one["values"].items()
+            for given in statuses:
+                status = kind(
+                    name=given["name"], message=given["message"], hardware_id="chainshaper"
+                )
+                status.level = (kind.OK, kind.WARN, kind.ERROR)[given["level"]]
+                values = given["values"].items()
                 status.values = [messages.KeyValue(key=key, value=text) for key, text in values]
                 array.status.append(status)
             publisher.publish(array)
 
 
 def print_graph(patience: float = 10.0) -> None:
+    """Print all endpoints as soon as discovery is over, at most after so many seconds."""
     with node_named(SNAPSHOT) as (_, node):
         begun = quiet_since = time.monotonic()
         known = -1
-        found: list[dict[str, Any]] = []
+        seen: list[dict[str, Any]] = []
         while time.monotonic() < min(
-            quiet_since + (QUIET_S if found else FIRST_S), begun + patience
+            quiet_since + (QUIET_S if seen else FIRST_S), begun + patience
         ):
-            found = endpoints(node)
-            unknown = any(one["node"].endswith(UNKNOWN_NODE) for one in found)
-            if unknown or len(found) != known:  # whose an endpoint is comes behind it
-                known, quiet_since = len(found), time.monotonic()
+            seen = endpoints(node)
+            # The node of an endpoint is discovered behind the endpoint.
+            unknown = any(endpoint["node"].endswith(UNKNOWN_NODE) for endpoint in seen)
+            if unknown or len(seen) != known:
+                known, quiet_since = len(seen), time.monotonic()
             time.sleep(LOOK_S)
-        json.dump({"endpoints": found}, sys.stdout)
+        json.dump({"endpoints": seen}, sys.stdout)
 
 
 def endpoints(node: Any) -> list[dict[str, Any]]:
-    """All publishers and subscriptions that ``node`` knows of, its own left out."""
+    """Return all publishers and subscriptions that ``node`` knows of, without its own."""
     return [
         as_json(topic, kind, info)
         for topic, _ in node.get_topic_names_and_types()
@@ -104,8 +109,9 @@ def endpoints(node: Any) -> list[dict[str, Any]]:
 
 
 def as_json(topic: str, kind: str, info: Any) -> dict[str, Any]:
+    """Return an endpoint with its type and QoS."""
     qos = info.qos_profile
-    found = {
+    endpoint = {
         "node": info.node_namespace.rstrip("/") + "/" + info.node_name,
         "topic": topic,
         "kind": kind,
@@ -113,42 +119,45 @@ def as_json(topic: str, kind: str, info: Any) -> dict[str, Any]:
         "depth": qos.depth,
     }
     for word in ("reliability", "durability", "history", "liveliness"):
-        found[word] = getattr(qos, word).name.lower()
+        endpoint[word] = getattr(qos, word).name.lower()
     for name, duration in (
         ("deadline_ns", qos.deadline),
         ("lifespan_ns", qos.lifespan),
         ("liveliness_lease_ns", qos.liveliness_lease_duration),
     ):
         nanoseconds = int(duration.nanoseconds)
-        found[name] = nanoseconds if 0 < nanoseconds < INFINITE_NS else None
-    return found
+        endpoint[name] = nanoseconds if 0 < nanoseconds < INFINITE_NS else None
+    return endpoint
 
 
 def set_parameter(name: str, value: str, *nodes: str) -> None:
+    """Set an integer parameter of nodes; exit with the problems, if there are any."""
     with node_named(SETTER) as (rclpy, node):
         service: Any = importlib.import_module("rcl_interfaces.srv").SetParameters
         parameter: Any = importlib.import_module("rclpy.parameter").Parameter
         wanted = parameter(name, parameter.Type.INTEGER, int(value)).to_parameter_msg()
         request = service.Request(parameters=[wanted])
-        clients = {one: node.create_client(service, f"{one}/set_parameters") for one in nodes}
+        clients = {
+            target: node.create_client(service, f"{target}/set_parameters") for target in nodes
+        }
         answers: dict[str, Any] = {}
         until = time.monotonic() + ANSWER_S
         while time.monotonic() < until:
-            for one, client in clients.items():
-                if one not in answers and client.service_is_ready():
-                    answers[one] = client.call_async(request)
+            for target, client in clients.items():
+                if target not in answers and client.service_is_ready():
+                    answers[target] = client.call_async(request)
             rclpy.spin_once(node, timeout_sec=SPIN_S)
             if len(answers) == len(nodes) and all(answer.done() for answer in answers.values()):
                 break
         count = getattr(node, "count_services", lambda _: 1)
-        offered = {one: count(f"{one}/set_parameters") for one in nodes}
-    asked = [problem(one, name, answers.get(one), offered[one]) for one in nodes]
-    if any(asked):
-        sys.exit("; ".join(filter(None, asked)))
+        offered = {target: count(f"{target}/set_parameters") for target in nodes}
+    problems = [problem(target, name, answers.get(target), offered[target]) for target in nodes]
+    if any(problems):
+        sys.exit("; ".join(filter(None, problems)))
 
 
 def problem(node: str, name: str, answer: Any, offered: int) -> "str | None":
-    """Why a node's parameter is not what it was set to, as far as the answer says."""
+    """Return why a node's parameter is not what it was set to; None: it is."""
     if offered > 1:
         return f"{offered} participants answer for {node}, so none of them is believed"
     if answer is None:

@@ -305,6 +305,11 @@ private:
     auto outcome = shaper_.hold();
     if (!outcome) return;
     if (turn_ && turn_->was_bypassed(key)) return readiness_.ask_for();
+    const auto & newer = shaper_.queue.waiting;
+    if (turn_ && std::any_of(newer.begin(), newer.end(), [this](const auto & waiting) {
+          return turn_->is_overtaken_by(key_of(waiting));
+        }))
+      outcome->release.drop(Dropped::replaced);
     Maybe published_ns, stalled_ns;
     if (outcome->release.at_ns) {
       try {

@@ -245,6 +245,12 @@ public:
     return true;
   }
 
+  // Returns whether the standby has dealt with this message, which is behind the one in hand: that
+  // one would come after it. To be called after `was_bypassed`.
+  bool is_overtaken_by(std::int64_t key) const {
+    return std::binary_search(bypassed_.begin(), bypassed_.end(), key);
+  }
+
   void done(std::int64_t key) {
     drop(key);
     page_->set(Field::until_ns, monotonic_ns());

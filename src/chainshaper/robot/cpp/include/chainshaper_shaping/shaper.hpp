@@ -39,7 +39,8 @@ inline Gate gate_of(const Parameters & parameters, std::size_t depth) {
   gate.depth = depth;
   if (!parameters.mode_topic.empty()) {
     gate.modes = parameters.mode_names;
-    gate.bands.assign(parameters.mode_slots.begin(), parameters.mode_slots.end());
+    for (const auto number : parameters.mode_slots)  // from 1, as bands of a plan
+      gate.mode_slots.push_back(static_cast<std::size_t>(number - 1));
     gate.first_mode = word_named<std::size_t>(gate.modes, parameters.mode_default);
     gate.late = word_named<Policy>(policy_names, parameters.mode_late);
   }
@@ -185,7 +186,8 @@ public:
         look_again();
         now = monotonic_ns();
       }
-      if (!slept && queue.gate.messages == Messages::newest) look_again();
+      // The first time, it may have come long ago, and newer ones since.
+      if (!slept && (queue.gate.messages == Messages::newest || looked_ns_ == 0)) look_again();
       if (queue.waiting.front().number != number) return std::nullopt;
       if (queue.replaced(release, now)) release.drop(Dropped::replaced);
     }
