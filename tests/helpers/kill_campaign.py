@@ -47,8 +47,11 @@ from chainshaper.planning import Plan
 HERE = Path(__file__).parent
 CLI = [sys.executable, "-m", "chainshaper"]
 WORK, SMALL = Path("/mnt"), "3m"
-TIDY_S = 40.0
-"""Until all is as before: a guardian has a tenth of a second, a busy machine much more."""
+TIDY_S = 90.0
+"""Until all is as before: a guardian has a tenth of a second, a busy machine much more.
+
+A run waits a minute for a node that is stopped (:data:`chainshaper.workload.launcher.ANSWER_S`).
+"""
 INSIDE = "CHAINSHAPER_KILL_CAMPAIGN"
 EMPTY = (Path("/dev/shm"), Path("/tmp"))
 LONGEST_S = {"start": 12.0, "writing": 12.0, "in force": 0.5}
