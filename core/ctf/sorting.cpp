@@ -1,6 +1,8 @@
 #include "ctf/sorting.hpp"
 
+#include <algorithm>
 #include <limits>
+#include <memory>
 #include <numeric>
 #include <stdexcept>
 
@@ -8,7 +10,25 @@ namespace chainshaper::ctf {
 namespace {
 
 using Times = std::span<const std::int64_t>;
-using Order = std::vector<std::uint32_t>;  // numbers of rows
+using RowNumber = std::uint32_t;
+using Order = std::span<RowNumber>;
+
+// Memory that sorting works in. A thread keeps it from table to table, for as long as it lives: to
+// get it from the kernel anew, which zeroes it, would cost as much as a third of the sorting.
+struct Room {
+  std::size_t rows{0};
+  std::unique_ptr<RowNumber[]> order;
+  std::unique_ptr<RowNumber[]> merged;
+  std::unique_ptr<std::uint8_t[]> values;  // 8 bytes a row
+
+  void make_for(std::size_t needed) {
+    if (needed <= rows) return;
+    order = std::make_unique_for_overwrite<RowNumber[]>(needed);
+    merged = std::make_unique_for_overwrite<RowNumber[]>(needed);
+    values = std::make_unique_for_overwrite<std::uint8_t[]>(8 * needed);
+    rows = needed;
+  }
+};
 
 // Where runs of ascending times begin, and where the last one ends.
 std::vector<std::size_t> run_bounds(Times times) {
@@ -20,7 +40,7 @@ std::vector<std::size_t> run_bounds(Times times) {
 }
 
 // Merges two runs of rows that follow each other; of equal times the left one's come first.
-void merge(Times times, const Order & from, Order & to, std::size_t left, std::size_t middle,
+void merge(Times times, Order from, Order to, std::size_t left, std::size_t middle,
            std::size_t end) {
   auto right = middle, place = left;
   while (left < middle && right < end) {
@@ -35,8 +55,9 @@ void merge(Times times, const Order & from, Order & to, std::size_t left, std::s
   while (right < end) to[place++] = from[right++];
 }
 
-Order order_of(Times times, std::vector<std::size_t> bounds) {
-  Order order(times.size()), merged(times.size());
+// The rows in order of time; it is somewhere in the room.
+Order order_of(Times times, std::vector<std::size_t> bounds, const Room & room) {
+  Order order(room.order.get(), times.size()), merged(room.merged.get(), times.size());
   std::iota(order.begin(), order.end(), 0U);
   while (bounds.size() > 2) {
     std::vector<std::size_t> fewer{0};
@@ -46,18 +67,18 @@ Order order_of(Times times, std::vector<std::size_t> bounds) {
       merge(times, order, merged, bounds[run], middle, end);
       fewer.push_back(end);
     }
-    order.swap(merged);
+    std::swap(order, merged);
     bounds = std::move(fewer);
   }
   return order;
 }
 
 template <typename Value>
-void reorder(std::uint8_t * values, const Order & order, std::vector<std::uint8_t> & room) {
+void reorder(std::uint8_t * values, Order order, std::uint8_t * room) {
   constexpr auto width = sizeof(Value);
   for (std::size_t row = 0; row < order.size(); ++row)
-    std::memcpy(room.data() + row * width, values + order[row] * width, width);
-  std::memcpy(values, room.data(), order.size() * width);
+    std::memcpy(room + row * width, values + order[row] * width, width);
+  std::memcpy(values, room, order.size() * width);
 }
 
 }  // namespace
@@ -70,8 +91,10 @@ void sort_by_time(const TableColumns & table) {
     if (column.rows != rows) throw std::invalid_argument("columns of different lengths");
   auto bounds = run_bounds(table.times_ns);
   if (bounds.size() == 2) return;
-  const auto order = order_of(table.times_ns, std::move(bounds));
-  std::vector<std::uint8_t> room(8 * rows);  // columns are reordered one after the other
+  thread_local Room room_of_thread;
+  room_of_thread.make_for(rows);
+  const auto order = order_of(table.times_ns, std::move(bounds), room_of_thread);
+  auto * const room = room_of_thread.values.get();  // of one column after the other
   reorder<std::uint64_t>(reinterpret_cast<std::uint8_t *>(table.times_ns.data()), order, room);
   if (table.cpus.size() == rows)
     reorder<std::uint32_t>(reinterpret_cast<std::uint8_t *>(table.cpus.data()), order, room);

@@ -107,6 +107,8 @@ def test_a_signal_while_the_interpreter_ends_leaves_no_traceback(number: signal.
         "sys.argv = ['chainshaper', '--version']\n"
         "entry.main()\n"
     )
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
+    # Who runs tests in the background of a shell has them ignore Ctrl-C.
+    command = ["env", "--default-signal=INT", sys.executable, "-c", program]
+    run = subprocess.run(command, capture_output=True, check=False)
     assert (run.returncode, run.stderr) == (-number, b"")
     assert run.stdout.startswith(b"chainshaper "), "it was done"

@@ -88,7 +88,7 @@ class Event:
         return self.fields
 
     def place_in_record(self, field: EventField) -> int | None:
-        """Return which of a record's values a field is in the library's memory; None: no one."""
+        """Return the place of a field in a record of the library's memory; None: it has none."""
         if self.recorded_by_library == "service call" or field.argument is None:
             return field.record_place
         return field.argument
