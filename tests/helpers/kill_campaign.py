@@ -655,12 +655,17 @@ def run_lane(given: argparse.Namespace, lane: int, folder: Path) -> bool:
     (groups / "cases" / "cgroup.procs").write_text("0")  # are not frozen one by one
     names = given.verbs or sorted(verbs(folder))
     victim, kills = Victim(), -(-given.kills // given.lanes)
+
+    def pauses() -> None:
+        while pause is not None and given.pause_while.name in os.listdir(pause):  # noqa: PTH208
+            time.sleep(1)
+
     for verb in names[lane :: given.lanes]:
+        pauses()
         sys.stdout.write(json.dumps(vars(rehearse(verb, folder))) + "\n")
         sys.stdout.flush()
     for seed in itertools.count(given.seed + lane, given.lanes):
-        while pause is not None and given.pause_while.name in os.listdir(pause):  # noqa: PTH208
-            time.sleep(1)
+        pauses()
         if sums["a kill"] == kills or time.monotonic() > until:
             break
         case = Case(seed, names[seed % len(names)])
