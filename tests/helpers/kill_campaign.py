@@ -12,8 +12,9 @@ line of JSON for each case, and one with the sums of each lane; a case is repeat
 
 The instant is a random share of the time for which the verb went on the last time, behind its
 start, its first writing, or the moment from which its plan was in force. A case whose verb has
-ended before it is counted as `too late`, and not as a kill. All lanes know how long verbs go on.
-With `--rehearse` each verb goes on to its end before, so that one that is refused at once is seen.
+ended before it is counted as `too late`, and not as a kill.
+Each verb goes on to its end once before (`behind` is `end`): so all lanes know for how long, and a
+verb that is refused at once is seen.
 
 Python's own traceback is a finding, but for Ctrl-C before the first line of ours could run: until
 then the interpreter has its own handler, which no program can replace (`before our first line`).
@@ -47,15 +48,18 @@ from chainshaper.planning import Plan
 HERE = Path(__file__).parent
 CLI = [sys.executable, "-m", "chainshaper"]
 WORK, SMALL = Path("/mnt"), "3m"
-TIDY_S = 40.0
-"""Until all is as before: a guardian has a tenth of a second, a busy machine much more."""
+TIDY_S = 90.0
+"""Until all is as before: a guardian has a tenth of a second, a busy machine much more.
+
+A run waits a minute for a node that is stopped (:data:`chainshaper.workload.launcher.ANSWER_S`).
+"""
 INSIDE = "CHAINSHAPER_KILL_CAMPAIGN"
 EMPTY = (Path("/dev/shm"), Path("/tmp"))
 LONGEST_S = {"start": 12.0, "writing": 12.0, "in force": 0.5}
 """A kill comes this long at most behind each of these."""
 FIRST_S = {"start": 1.0, "writing": 0.1, "in force": 0.5}
 """The same while nobody knows yet how long the verb goes on."""
-LONGER = 1.05
+LONGER = 1.1
 """So much longer a verb is taken to go on for each kill that hits: too few are too late else."""
 PATIENCE_S = (2.0, 2.0, 40.0)
 """What was asked to end may take so long, then it is killed."""
@@ -412,7 +416,10 @@ def run_case(case: Case, folder: Path, victim: Victim) -> None:
 
 
 def rehearse(verb: str, folder: Path) -> Case:
-    """Let a verb go on to its end; a plan that is in force is ended by Ctrl-C, nodes are killed."""
+    """Let a verb go on to its end, and note for how long it does.
+
+    A plan that is in force is ended by Ctrl-C, nodes are killed.
+    """
     from processes import marked_processes
 
     case, marker = Case(0, verb, behind="end"), f"CASE={uuid.uuid4().hex}"
@@ -431,7 +438,13 @@ def rehearse(verb: str, folder: Path) -> Case:
     def done() -> bool:
         return process.poll() is not None or (stays and b"in force" in output_of())
 
+    wait(lambda: done() or writes(), 90)
+    wrote = time.monotonic()
     wait(done, 3 if verb == "handover" else 90)
+    now = time.monotonic()
+    note_span(folder, Case(0, verb, behind="start"), now - began)
+    if output is not None:
+        note_span(folder, Case(0, verb, behind="writing"), now - wrote)
     if process.poll() is None:
         case.faults.append("SIGINT, for it went on")
         process.send_signal(signal.SIGINT)
@@ -593,7 +606,6 @@ def main() -> None:
     arguments.add_argument("--seed", type=int, default=1)
     arguments.add_argument("--seconds", type=float, default=600.0, help="no case begins later")
     arguments.add_argument("--verbs", nargs="+", help="of these alone; apply alone is real-time")
-    arguments.add_argument("--rehearse", action="store_true", help="each verb once, to its end")
     arguments.add_argument("--lanes", type=int, default=1, help="so many cases side by side")
     arguments.add_argument("--core", type=int, help="run on this core alone")
     arguments.add_argument("--pause-while", type=Path, metavar="FILE")
@@ -643,12 +655,17 @@ def run_lane(given: argparse.Namespace, lane: int, folder: Path) -> bool:
     (groups / "cases" / "cgroup.procs").write_text("0")  # are not frozen one by one
     names = given.verbs or sorted(verbs(folder))
     victim, kills = Victim(), -(-given.kills // given.lanes)
-    for verb in names[lane :: given.lanes] if given.rehearse else ():
+
+    def pauses() -> None:
+        while pause is not None and given.pause_while.name in os.listdir(pause):  # noqa: PTH208
+            time.sleep(1)
+
+    for verb in names[lane :: given.lanes]:
+        pauses()
         sys.stdout.write(json.dumps(vars(rehearse(verb, folder))) + "\n")
         sys.stdout.flush()
     for seed in itertools.count(given.seed + lane, given.lanes):
-        while pause is not None and given.pause_while.name in os.listdir(pause):  # noqa: PTH208
-            time.sleep(1)
+        pauses()
         if sums["a kill"] == kills or time.monotonic() > until:
             break
         case = Case(seed, names[seed % len(names)])
