@@ -186,7 +186,7 @@ def test_a_process_that_ends_or_is_killed_is_left_and_another_is_found(tmp_path:
             # That the first is still there is what makes the second run worth a look.
             assert len(watch.processes) == number
             assert looks[-1].chains[0].problem is None, "what has ended is no second path"
-    watch.read()
+    watch.read()  # what they wrote until they ended
     watch._searched_ns = 0
     watch._latest = dict.fromkeys(watch._latest, 0)  # as twelve seconds later
     watch.read()
