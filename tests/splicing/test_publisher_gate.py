@@ -266,7 +266,7 @@ def test_on_humble_a_message_is_stamped_behind_the_event_of_its_publication(
     """Its publication is the last one before its stamp: events of publications have none there."""
     times = [n * 100 * MS + 20 * MS for n in range(4)]
     lines = [at(ns, stamp=ns - 20 * MS) for ns in times]
-    done = run({"/t5": SLOT}, lines, ROS_DISTRO="humble")
+    done = run({"/t5": SLOT}, lines, on_time=True, ROS_DISTRO="humble")
     of_input = done.of("trace", "rmw_publish")[::2]  # each waits for its slot, and goes on then
     stamps = [row["source_timestamp"] for row in done.logs["/t5"]]
     published = [int(event[5]) for event in of_input]
