@@ -487,8 +487,9 @@ def kill_some(
             os.kill(process.pid, signal.SIGKILL)
             case.faults.append(f"SIGKILL to the verb after {patience_s:.0f} s")
     for pid in chosen if stops else ():
-        with contextlib.suppress(OSError):  # what is stopped cannot end; nobody kills applications
-            if b"__node:=first" in Path(f"/proc/{pid}/cmdline").read_bytes():
+        with contextlib.suppress(OSError):  # what is stopped cannot end, and only ours is killed
+            is_application = b"__node:=first" in Path(f"/proc/{pid}/cmdline").read_bytes()
+            if is_application or pids[pid] == "bpftrace":
                 os.kill(pid, signal.SIGCONT)
 
 
