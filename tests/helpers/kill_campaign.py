@@ -98,7 +98,11 @@ import subprocess, sys
 folder, program = sys.argv[1:]
 words = [sys.executable, program, folder]
 pair = [
-    subprocess.Popen([*words, what, "t5", port, "2000000"], stdout=subprocess.DEVNULL)
+    subprocess.Popen(
+        [*words, what, "t5", port, "2000000"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
     for what, port in (("shaping", "7001"), ("standby", "7002"))
 ]
 for process in pair:
@@ -482,6 +486,11 @@ def kill_some(
         with contextlib.suppress(ProcessLookupError):  # stopped, or it had another killed
             os.kill(process.pid, signal.SIGKILL)
             case.faults.append(f"SIGKILL to the verb after {patience_s:.0f} s")
+    for pid in chosen if stops else ():
+        with contextlib.suppress(OSError):  # what is stopped cannot end, and only ours is killed
+            is_application = b"__node:=first" in Path(f"/proc/{pid}/cmdline").read_bytes()
+            if is_application or pids[pid] == "bpftrace":
+                os.kill(pid, signal.SIGCONT)
 
 
 def look_behind(case: Case, victim: Victim, marker: str, output: Path | None) -> None:
