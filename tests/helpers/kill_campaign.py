@@ -655,8 +655,9 @@ def run_lane(given: argparse.Namespace, lane: int, folder: Path) -> bool:
     """Cases one after the other, in namespaces of their own: whether something was left."""
     from chainshaper.linux.cgroups import mount_point
 
+    # A shell has what it runs in the background ignore these, and so would all that a lane starts.
     for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):
-        signal.signal(number, signal.SIG_DFL)  # a script's background job ignores them, and its own
+        signal.signal(number, signal.SIG_DFL)
     pause = given.pause_while and os.open(given.pause_while.parent, os.O_RDONLY | os.O_DIRECTORY)
     groups = mount_point()
     for words in (
