@@ -6,11 +6,19 @@ The five-node chain of examples/synthetic_chain.yaml on one core, with every eve
 latencies only: chain instances per second of the process's CPU time, and of wall-clock time.
 
 Against the engine before, compiled by Numba, medians of runs in turns: without events 1.35 times
-as many instances per second of CPU time (1,670,000 instead of 1,240,000). With events the CPU time
-is nearly the same (141,000 instead of 138,000, beside other work): more than half of it is Polars
-writing Parquet, and two fifths of that is compression. Threads write while the engine goes on,
-which makes 1.8 times as many per second of wall-clock time in the same runs (2.0 instead of 3.6 s
-for 200,000 cycles on two cores that others kept busy).
+as many instances per second of CPU time (1,670,000 instead of 1,240,000). With events, in fresh
+processes in turns beside other work (7 each, 200,000 cycles): seconds, in brackets the ratio to the
+old engine:
+
+    =====================================  ===========  ===========
+    tables written by                      wall         CPU
+    =====================================  ===========  ===========
+    Numba's engine, Polars                 2.84         1.52
+    this engine, Polars                    1.62 (1.75)  1.60 (0.95)
+    this engine, packed (values/parquet)   1.11 (2.57)  0.90 (1.69)
+    =====================================  ===========  ===========
+
+Threads write while the engine goes on. The packed files are 9 % larger.
 
 Peers run in interpreters of their own, such as those of throwaway virtual environments, since SimSo
 wants an old SimPy:

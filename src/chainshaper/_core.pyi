@@ -663,3 +663,6 @@ class Simulation:
     @property
     def now_ns(self) -> int:
         """The present instant."""
+
+def delta_packed(numbers: NDArray[np.int32] | NDArray[np.int64]) -> bytes:
+    """A column, which must be contiguous, in Parquet's encoding DELTA_BINARY_PACKED."""

@@ -259,7 +259,7 @@ def test_a_place_that_another_chain_has_is_why_slots_do_not_follow() -> None:
     follower._cores, follower._stop, follower.failure = (), Event(), None
     follower._chain, follower._planned_ns = cast("ChainPlan", SimpleNamespace(cycle_ns=MS)), 0
     tail = SimpleNamespace(start_ns=0)
-    tail.saw = lambda seen_ns: setattr(tail, "start_ns", seen_ns)
+    tail.add = lambda seen_ns: setattr(tail, "start_ns", seen_ns)
     follower._tail, follower._put_in_force = cast("Tail", tail), refuse
     follower._output = cast("FollowedOutput", SimpleNamespace(latencies=lambda: [MS]))
     follower._follow()

@@ -12,8 +12,9 @@ line of JSON for each case, and one with the sums of each lane; a case is repeat
 
 The instant is a random share of the time for which the verb went on the last time, behind its
 start, its first writing, or the moment from which its plan was in force. A case whose verb has
-ended before it is counted as `too late`, and not as a kill. All lanes know how long verbs go on.
-With `--rehearse` each verb goes on to its end before, so that one that is refused at once is seen.
+ended before it is counted as `too late`, and not as a kill.
+Each verb goes on to its end once before (`behind` is `end`): so all lanes know for how long, and a
+verb that is refused at once is seen.
 
 Python's own traceback is a finding, but for Ctrl-C before the first line of ours could run: until
 then the interpreter has its own handler, which no program can replace (`before our first line`).
@@ -47,15 +48,18 @@ from chainshaper.planning import Plan
 HERE = Path(__file__).parent
 CLI = [sys.executable, "-m", "chainshaper"]
 WORK, SMALL = Path("/mnt"), "3m"
-TIDY_S = 40.0
-"""Until all is as before: a guardian has a tenth of a second, a busy machine much more."""
+TIDY_S = 90.0
+"""Until all is as before: a guardian has a tenth of a second, a busy machine much more.
+
+A run waits a minute for a node that is stopped (:data:`chainshaper.workload.launcher.ANSWER_S`).
+"""
 INSIDE = "CHAINSHAPER_KILL_CAMPAIGN"
 EMPTY = (Path("/dev/shm"), Path("/tmp"))
 LONGEST_S = {"start": 12.0, "writing": 12.0, "in force": 0.5}
 """A kill comes this long at most behind each of these."""
 FIRST_S = {"start": 1.0, "writing": 0.1, "in force": 0.5}
 """The same while nobody knows yet how long the verb goes on."""
-LONGER = 1.05
+LONGER = 1.1
 """So much longer a verb is taken to go on for each kill that hits: too few are too late else."""
 PATIENCE_S = (2.0, 2.0, 40.0)
 """What was asked to end may take so long, then it is killed."""
@@ -94,7 +98,11 @@ import subprocess, sys
 folder, program = sys.argv[1:]
 words = [sys.executable, program, folder]
 pair = [
-    subprocess.Popen([*words, what, "t5", port, "2000000"], stdout=subprocess.DEVNULL)
+    subprocess.Popen(
+        [*words, what, "t5", port, "2000000"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
     for what, port in (("shaping", "7001"), ("standby", "7002"))
 ]
 for process in pair:
@@ -305,7 +313,8 @@ class Victim:
         pid, said = self.process.pid, []
         if (now := scheduling(pid)) != self.before:
             said.append(f"the node's scheduling is {now}, and was {self.before}")
-        said += [f"the group {one.name} is left" for one in self.group.iterdir() if one.is_dir()]
+        groups = [place.name for place in self.group.iterdir() if place.is_dir()]
+        said += [f"the group {name} is left" for name in groups]
         ran = cpu_ns(pid)
         if not wait(lambda: cpu_ns(pid) > ran, 10):
             said.append("the node does not run")
@@ -374,25 +383,37 @@ def await_instant(
     note_span(folder, case, time.monotonic() - began if ended() else span_s * LONGER)
 
 
+def started(verb: str, words: list[str]) -> tuple[subprocess.Popen[bytes], str]:
+    """Start a verb; return it, and what the environment of all its processes has in it."""
+    name, mark = "CASE", uuid.uuid4().hex
+    with (WORK / "said").open("wb") as said:  # on a mount of this lane alone
+        process = subprocess.Popen(
+            command(verb, words),
+            env={**os.environ, name: mark},
+            stdin=subprocess.DEVNULL,
+            stdout=said,
+            stderr=said,
+        )
+    return process, f"{name}={mark}"
+
+
+def how_it_ended(process: subprocess.Popen[bytes]) -> str:
+    """Say with which exit code a verb has ended, and its last line."""
+    last = output_of().decode(errors="replace").strip().rpartition("\n")[2]
+    return f"exit code {process.returncode}: {last[-300:]}"
+
+
 def run_case(case: Case, folder: Path, victim: Victim) -> None:
     """Start the verb, kill, and look."""
-    from processes import marked_processes
+    from processes import kill_marked, marked_processes
 
-    chance, marker = random.Random(case.seed), f"CASE={uuid.uuid4().hex}"
+    chance = random.Random(case.seed)
     words, output = verbs(folder)[case.verb]
-    environment = {**os.environ, **dict([marker.split("=")])}
     with contextlib.ExitStack() as disks:
         case.full = chance.choice(("", "", "", "its disk", "/run"))
         if case.full:
             disks.enter_context(filled(WORK / "small" if case.full == "its disk" else Path("/run")))
-        with (WORK / "said").open("wb") as said:
-            process = subprocess.Popen(
-                command(case.verb, words),
-                env=environment,
-                stdin=subprocess.DEVNULL,
-                stdout=said,
-                stderr=said,
-            )
+        process, marker = started(case.verb, words)
         if case.verb.startswith("apply") and case.full != "/run" and chance.random() < 0.7:
             case.behind = "in force"
         elif output is not None and not case.full and chance.random() < 0.5:
@@ -401,54 +422,59 @@ def run_case(case: Case, folder: Path, victim: Victim) -> None:
         pids = marked_processes(marker)
         case.kill = "a kill" if pids else "too late"
         if process.poll() is not None:
-            last = output_of().decode(errors="replace").strip().rpartition("\n")[2]
-            case.ended += f"exit code {process.returncode}: {last[-200:]}"
-        kill_some(case, process, pids, chance)
+            case.ended += how_it_ended(process)
+        kill_some(case, process, pids, marker, chance)
         process.wait()
     look_behind(case, victim, marker, output)
-    for pid in marked_processes(marker):
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
+    kill_marked(marker)
 
 
 def rehearse(verb: str, folder: Path) -> Case:
-    """Let a verb go on to its end; a plan that is in force is ended by Ctrl-C, nodes are killed."""
-    from processes import marked_processes
+    """Let a verb go on to its end, and note for how long it does.
 
-    case, marker = Case(0, verb, behind="end"), f"CASE={uuid.uuid4().hex}"
+    A plan that is in force is ended by Ctrl-C, nodes are killed.
+    """
+    from processes import kill_marked
+
+    case, began = Case(0, verb, behind="end"), time.monotonic()
     words, output = verbs(folder)[verb]
-    environment, began = {**os.environ, **dict([marker.split("=")])}, time.monotonic()
-    with (WORK / "said").open("wb") as said:
-        process = subprocess.Popen(
-            command(verb, words),
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=said,
-            stderr=said,
-        )
+    process, marker = started(verb, words)
     stays = verb.startswith("apply") and output is None
 
     def done() -> bool:
         return process.poll() is not None or (stays and b"in force" in output_of())
 
+    wait(lambda: done() or writes(), 90)
+    wrote = time.monotonic()
     wait(done, 3 if verb == "handover" else 90)
+    now = time.monotonic()
+    note_span(folder, Case(0, verb, behind="start"), now - began)
+    if output is not None:
+        note_span(folder, Case(0, verb, behind="writing"), now - wrote)
     if process.poll() is None:
         case.faults.append("SIGINT, for it went on")
         process.send_signal(signal.SIGINT)
+    if not wait(lambda: process.poll() is not None, 60):
+        case.faults.append("SIGKILL, for it did not end")
+        process.kill()
     process.wait()
     case.after_s = round(time.monotonic() - began, 3)
-    last = output_of().decode(errors="replace").strip().rpartition("\n")[2]
-    case.ended = f"exit code {process.returncode}: {last[-300:]}"
-    for pid in marked_processes(marker):
-        os.kill(pid, signal.SIGKILL)
+    case.ended = how_it_ended(process)
+    kill_marked(marker)
     remove_outputs()
     return case
 
 
 def kill_some(
-    case: Case, process: subprocess.Popen[bytes], pids: dict[int, str], chance: random.Random
+    case: Case,
+    process: subprocess.Popen[bytes],
+    pids: dict[int, str],
+    marker: str,
+    chance: random.Random,
 ) -> None:
     """Kill or stop the verb, one of its processes or both; then the verb, if it does not end."""
+    from processes import send_to_marked
+
     chosen = {process.pid} & {*pids} if chance.random() < 0.7 else set[int]()
     if pids and (not chosen or chance.random() < 0.6):
         chosen.add(chance.choice(sorted(pids)))
@@ -459,35 +485,37 @@ def kill_some(
     for pid in chosen:
         name = "the verb" if pid == process.pid else pids[pid]
         case.faults.append(f"{'SIGSTOP, then ' if stops else ''}{number.name} to {name}")
-        for one in (signal.SIGSTOP, number) if stops else (number,):
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, one)
+        if stops:
+            send_to_marked(marker, pid, signal.SIGSTOP)
+        send_to_marked(marker, pid, number)
     patience_s = chance.choice(PATIENCE_S)
     if stops or process.pid not in chosen:
         patience_s = min(PATIENCE_S)
     if not wait(lambda: process.poll() is not None, patience_s):
-        with contextlib.suppress(ProcessLookupError):  # stopped, or it had another killed
-            os.kill(process.pid, signal.SIGKILL)
-            case.faults.append(f"SIGKILL to the verb after {patience_s:.0f} s")
+        process.kill()  # it is stopped, or had another killed
+        case.faults.append(f"SIGKILL to the verb after {patience_s:.0f} s")
+    # Nobody ends what is stopped but is no guardian and no dispatcher: an application, which only
+    # hears SIGINT, or a process that had not come to its first line.
+    for pid in chosen - {process.pid} if stops else ():
+        if not pids[pid].startswith(("guardian", "dispatcher")):
+            send_to_marked(marker, pid, signal.SIGCONT)
 
 
 def look_behind(case: Case, victim: Victim, marker: str, output: Path | None) -> None:
     """Note what is left when there was time enough, and `release` has had its turn."""
-    from processes import marked_processes
+    from processes import kill_marked, marked_processes
 
     def orphans() -> list[str]:
-        pids = marked_processes(marker)
         if case.verb == "handover":  # the nodes of a robot outlive who has started them
-            for pid in pids:
-                os.kill(pid, signal.SIGKILL)
-            pids = {}
-        return [f"{name} ({pid}) runs" for pid, name in pids.items()]
+            kill_marked(marker)
+            return []
+        return [f"{name} ({pid}) runs" for pid, name in marked_processes(marker).items()]
 
     wait(lambda: not orphans() and not victim.changed(), TIDY_S)
     small = WORK / "small"
     for place in (small, *EMPTY):
-        for one in place.iterdir():  # as if time had passed, for what has just been made is left
-            os.utime(one, (time.time() - 60,) * 2, follow_symlinks=False)
+        for file in place.iterdir():  # as if time had passed, for what has just been made is left
+            os.utime(file, (time.time() - 60,) * 2, follow_symlinks=False)
     released = subprocess.run([*CLI, "release"], capture_output=True, check=False, cwd=small)
     if b"Traceback" in released.stderr:
         case.left.append(f"release: {released.stderr.decode(errors='replace')[-900:]}")
@@ -495,20 +523,20 @@ def look_behind(case: Case, victim: Victim, marker: str, output: Path | None) ->
     if (said := output_of()) and b"Traceback" in said:
         case.left += tracebacks(case, said)
     for place in EMPTY:  # the folder of pages of a user stays where /run had no room
-        left = [one for one in place.iterdir() if one.name != f"chainshaper-{os.geteuid()}"]
-        case.left += [f"{one} is left" for one in left]
+        of_user = f"chainshaper-{os.geteuid()}"
+        case.left += [f"{file} is left" for file in place.iterdir() if file.name != of_user]
     runs = Path("/run/chainshaper")
     pages = [*(runs / "outputs").iterdir()] if (runs / "outputs").is_dir() else []
     if runs.is_dir():
-        case.left += [f"{one} is left" for one in runs.iterdir() if one.name != "outputs"]
-    for one in pages:
-        case.left.append(f"the page {one} is left")
-        one.unlink()
-    for one in small.iterdir():
-        mark = one.name.rpartition(".tracing-")
+        case.left += [f"{file} is left" for file in runs.iterdir() if file.name != "outputs"]
+    for page in pages:
+        case.left.append(f"the page {page} is left")
+        page.unlink()
+    for file in small.iterdir():
+        mark = file.name.rpartition(".tracing-")
         named = mark[1] and mark[2].encode() in released.stderr
-        if one.name.startswith(".") and not named:
-            case.left.append(f"beside the output: {one.name!r}")
+        if file.name.startswith(".") and not named:
+            case.left.append(f"beside the output: {file.name!r}")
     if output is not None:
         case.left += half_written(output)
     remove_outputs()
@@ -516,8 +544,8 @@ def look_behind(case: Case, victim: Victim, marker: str, output: Path | None) ->
 
 def remove_outputs() -> None:
     for place in (WORK / "small", *EMPTY):
-        for one in place.iterdir():
-            subprocess.run(["rm", "-rf", str(one)], check=True)
+        for left in place.iterdir():
+            subprocess.run(["rm", "-rf", str(left)], check=True)
 
 
 _FRAME = re.compile(r'File "([^"]+)"')
@@ -529,7 +557,7 @@ def tracebacks(case: Case, said: bytes) -> Iterator[str]:
     for trace in text.split("Traceback (most recent call last)")[1:]:
         frames = [name for name in _FRAME.findall(trace) if "/chainshaper/" in name]
         early = all(name.endswith(("chainshaper/__init__.py", "__main__.py")) for name in frames)
-        asked = any("SIGINT" in one for one in case.faults)
+        asked = any("SIGINT" in fault for fault in case.faults)
         if "KeyboardInterrupt" in trace and early and asked:
             case.faults.append("a traceback before our first line")
         else:
@@ -544,11 +572,12 @@ def half_written(output: Path) -> Iterator[str]:
     import polars as pl
 
     if output.is_dir() and output.name == "figures":
-        for one in output.iterdir():
-            if not one.read_bytes().endswith(b"IEND\xaeB`\x82"):
-                yield f"half a figure: {one}"
+        for figure in output.iterdir():
+            if not figure.read_bytes().endswith(b"IEND\xaeB`\x82"):
+                yield f"half a figure: {figure}"
     elif output.is_dir() and output.name == "pkg":
-        if empty := [one for one in output.rglob("*") if one.is_file() and not one.stat().st_size]:
+        files = [path for path in output.rglob("*") if path.is_file()]
+        if empty := [path for path in files if not path.stat().st_size]:
             yield f"an empty file in a package: {empty}"
         if not [*output.iterdir()]:
             yield "an empty package"
@@ -593,7 +622,6 @@ def main() -> None:
     arguments.add_argument("--seed", type=int, default=1)
     arguments.add_argument("--seconds", type=float, default=600.0, help="no case begins later")
     arguments.add_argument("--verbs", nargs="+", help="of these alone; apply alone is real-time")
-    arguments.add_argument("--rehearse", action="store_true", help="each verb once, to its end")
     arguments.add_argument("--lanes", type=int, default=1, help="so many cases side by side")
     arguments.add_argument("--core", type=int, help="run on this core alone")
     arguments.add_argument("--pause-while", type=Path, metavar="FILE")
@@ -617,16 +645,19 @@ def main() -> None:
 
 
 def _remove_groups(folder: Path) -> None:
-    for one in folder.iterdir():
-        if one.is_dir():
-            _remove_groups(one)
-            _removed(one)
+    for group in folder.iterdir():
+        if group.is_dir():
+            _remove_groups(group)
+            _removed(group)
 
 
 def run_lane(given: argparse.Namespace, lane: int, folder: Path) -> bool:
     """Cases one after the other, in namespaces of their own: whether something was left."""
     from chainshaper.linux.cgroups import mount_point
 
+    # A shell has what it runs in the background ignore these, and so would all that a lane starts.
+    for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
     pause = given.pause_while and os.open(given.pause_while.parent, os.O_RDONLY | os.O_DIRECTORY)
     groups = mount_point()
     for words in (
@@ -635,20 +666,26 @@ def run_lane(given: argparse.Namespace, lane: int, folder: Path) -> bool:
         ["ip", "link", "set", "lo", "up"],
     ):
         subprocess.run(words, check=True)
-    for place, size in ((Path("/run"), "256k"), (WORK, "64m"), *((one, "64m") for one in EMPTY)):
-        mount(place, size)
+    mount(Path("/run"), "256k")
+    for place in (WORK, *EMPTY):
+        mount(place, "64m")
     sums, until = Counter[str](), time.monotonic() + given.seconds
     mount_disks()
     (groups / "cases").mkdir()  # beside the victim's: threads of a group that has others in it
     (groups / "cases" / "cgroup.procs").write_text("0")  # are not frozen one by one
     names = given.verbs or sorted(verbs(folder))
     victim, kills = Victim(), -(-given.kills // given.lanes)
-    for verb in names[lane :: given.lanes] if given.rehearse else ():
+
+    def pauses() -> None:
+        while pause is not None and given.pause_while.name in os.listdir(pause):  # noqa: PTH208
+            time.sleep(1)
+
+    for verb in names[lane :: given.lanes]:
+        pauses()
         sys.stdout.write(json.dumps(vars(rehearse(verb, folder))) + "\n")
         sys.stdout.flush()
     for seed in itertools.count(given.seed + lane, given.lanes):
-        while pause is not None and given.pause_while.name in os.listdir(pause):  # noqa: PTH208
-            time.sleep(1)
+        pauses()
         if sums["a kill"] == kills or time.monotonic() > until:
             break
         case = Case(seed, names[seed % len(names)])

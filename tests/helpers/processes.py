@@ -1,8 +1,11 @@
 """What /proc says about the processes that a test started, directly or through others."""
 
+import os
+import signal
 import subprocess
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -18,10 +21,10 @@ def children_of(pid: int) -> list[int]:
 def is_alive(pid: int) -> bool:
     """Whether a process runs; one that is dead but not yet waited for does not."""
     try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        stat = Path(f"/proc/{pid}/stat").read_bytes()  # with its name, which may be no text
     except OSError:
         return False
-    return state not in {"Z", "X"}
+    return stat.rpartition(b")")[2].split()[0] not in {b"Z", b"X"}
 
 
 def marked_processes(marker: str) -> dict[int, str]:
@@ -29,14 +32,41 @@ def marked_processes(marker: str) -> dict[int, str]:
 
     Orphans are found as well: an environment stays when the parent is gone.
     """
-    found = {}
+    names = {}
     for pid in parents():
+        if _is_marked(pid, marker):
+            with suppress(OSError):  # it ended meanwhile
+                comm = Path(f"/proc/{pid}/comm").read_bytes()
+                names[pid] = comm.decode(errors="replace").strip()
+    return names
+
+
+def _is_marked(pid: int, marker: str) -> bool:
+    try:
+        return marker.encode() in Path(f"/proc/{pid}/environ").read_bytes()
+    except OSError:  # it has ended, or is another user's
+        return False
+
+
+def send_to_marked(marker: str, pid: int, *numbers: signal.Signals) -> None:
+    """Send signals to a process that has ``marker`` in its environment, if it is still there.
+
+    A stranger that has got its id meanwhile has not this marker, and gets none of them.
+    """
+    with suppress(ProcessLookupError):
+        pidfd = os.pidfd_open(pid)
         try:
-            if marker.encode() in Path(f"/proc/{pid}/environ").read_bytes():
-                found[pid] = Path(f"/proc/{pid}/comm").read_bytes().decode(errors="replace").strip()
-        except OSError:  # it ended meanwhile, or is another user's
-            continue
-    return found
+            for number in numbers:
+                if _is_marked(pid, marker):
+                    signal.pidfd_send_signal(pidfd, number)
+        finally:
+            os.close(pidfd)
+
+
+def kill_marked(marker: str) -> None:
+    """Kill all processes that have ``marker`` in their environment."""
+    for pid in marked_processes(marker):
+        send_to_marked(marker, pid, signal.SIGKILL)
 
 
 def real_time_threads(pids: list[int]) -> list[str]:

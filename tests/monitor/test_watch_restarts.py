@@ -73,15 +73,15 @@ def simulated(monkeypatch: pytest.MonkeyPatch) -> "Callable[..., Simulated]":
     spec.loader.exec_module(week)
 
     def begin(rate: int = 1000, attach: bool = True) -> Simulated:
-        one = Simulated(week, rate)
-        clock = SimpleNamespace(monotonic_ns=lambda: one.application.now)
+        watched = Simulated(week, rate)
+        clock = SimpleNamespace(monotonic_ns=lambda: watched.application.now)
         monkeypatch.setattr(watch_module, "time", clock)
-        monkeypatch.setattr(watch_module, "clock_offset", lambda: one.application.offset)
-        monkeypatch.setattr(watch_module, "memories", one.memories)
-        monkeypatch.setattr(watch_module, "Path", one.path)
+        monkeypatch.setattr(watch_module, "clock_offset", lambda: watched.application.offset)
+        monkeypatch.setattr(watch_module, "memories", watched.memories)
+        monkeypatch.setattr(watch_module, "Path", watched.path)
         if attach:
-            one.attach()
-        return one
+            watched.attach()
+        return watched
 
     return begin
 
@@ -93,13 +93,13 @@ def counted(seen: Seen) -> dict[str, int]:
 def test_cycles_that_never_arrive_are_counted_while_a_node_is_dead_and_once_after(
     simulated: "Callable[..., Simulated]", monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    one = simulated()
-    before = one.go_on(20)[-1]
+    watched = simulated()
+    before = watched.go_on(20)[-1]
     assert not broken_limits(BUDGET, before)
-    complete = one.application.cycles["complete"]
-    one.kill(monkeypatch)
-    dead = one.go_on(70)
-    lost = one.application.cycles["complete"] - complete
+    complete = watched.application.cycles["complete"]
+    watched.kill(monkeypatch)
+    dead = watched.go_on(70)
+    lost = watched.application.cycles["complete"] - complete
     first = next(seen for seen in dead if broken_limits(BUDGET, seen))
     assert first.at_ns < before.at_ns + 10 * SECOND
     for seen in (first, dead[-1]):  # as long as it is dead
@@ -109,26 +109,26 @@ def test_cycles_that_never_arrive_are_counted_while_a_node_is_dead_and_once_afte
     rates = [counted(b)["incomplete"] - counted(a)["incomplete"] for a, b in pairwise(dead[5:])]
     assert set(rates) == {2 * 70}, "fifty and twenty cycles a second"
     assert [chain.hops for chain in dead[-1].chains] == [(), ()], "of the last minute"
-    one.start_again()
-    assert not any(chain.problem for chain in one.go_on(20)[-1].chains)
-    one.application.advance(one.passed_ns, one.passed_ns)
-    one.application.now += 2 * one.watch.longest_ns
-    found = counted(one.watch.look())
-    assert sum(found.values()) == one.application.cycles.total(), "each is counted once"
-    assert found["complete"] == pytest.approx(one.application.cycles["complete"] - lost, abs=4)
-    assert len(one.watch.processes) == 6, "those that have ended are left"
+    watched.start_again()
+    assert not any(chain.problem for chain in watched.go_on(20)[-1].chains)
+    watched.application.advance(watched.passed_ns, watched.passed_ns)
+    watched.application.now += 2 * watched.watch.longest_ns
+    found = counted(watched.watch.look())
+    assert sum(found.values()) == watched.application.cycles.total(), "each is counted once"
+    assert found["complete"] == pytest.approx(watched.application.cycles["complete"] - lost, abs=4)
+    assert len(watched.watch.processes) == 6, "those that have ended are left"
 
 
 def test_a_node_that_is_started_again_is_no_second_path(
     simulated: "Callable[..., Simulated]",
 ) -> None:
-    one = simulated()
-    seen = one.go_on(10)
-    one.start_again()
-    seen += one.go_on(20)
+    watched = simulated()
+    seen = watched.go_on(10)
+    watched.start_again()
+    seen += watched.go_on(20)
     assert not any(chain.problem for look in seen[2:] for chain in look.chains)
-    assert counted(seen[-1])["incomplete"] <= one.application.cycles["incomplete"] + 4
-    assert sum(counted(seen[-1]).values()) == pytest.approx(one.begun(seen[-1]), abs=2)
+    assert counted(seen[-1])["incomplete"] <= watched.application.cycles["incomplete"] + 4
+    assert sum(counted(seen[-1]).values()) == pytest.approx(watched.begun(seen[-1]), abs=2)
 
 
 def look_at_two_that_run(watched: Simulated) -> Seen:
@@ -142,25 +142,25 @@ def look_at_two_that_run(watched: Simulated) -> Seen:
 def test_two_that_run_with_the_same_names_stay_unclear(
     simulated: "Callable[..., Simulated]",
 ) -> None:
-    one = simulated()
-    unclear = look_at_two_that_run(one)
+    watched = simulated()
+    unclear = look_at_two_that_run(watched)
     assert "paths match" in (unclear.chains[0].problem or "")
-    assert counted(unclear)["incomplete"] <= one.application.cycles["incomplete"] + 4
+    assert counted(unclear)["incomplete"] <= watched.application.cycles["incomplete"] + 4
 
 
 def test_what_was_before_the_watch_is_none_of_it(
     simulated: "Callable[..., Simulated]", tmp_path: Path
 ) -> None:
     """Rings have run over long before: nothing is lost, and nodes are known all the same."""
-    one = simulated(20_000, attach=False)
-    one.go_on(12, look=False)
-    one.attach()
-    began = one.application.now
-    seen = one.go_on(6)[-1]
+    watched = simulated(20_000, attach=False)
+    watched.go_on(12, look=False)
+    watched.attach()
+    began = watched.application.now
+    seen = watched.go_on(6)[-1]
     assert seen.lost == 0
     assert seen.chains[0].problem is None
     assert counted(seen)["complete"] > 100
-    tables = one.watch.save(tmp_path / "flight").events
+    tables = watched.watch.save(tmp_path / "flight").events
     assert min(int(tables[o]["time"][0]) for o in tables.keys() - events.CREATION) >= began
     assert tables["rcl_node_init"]["time"][0] < began
 
@@ -169,53 +169,53 @@ def test_a_look_that_is_held_up_counts_no_cycle_whose_events_it_has_not_read(
     simulated: "Callable[..., Simulated]", monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On a busy machine nobody knows how long it takes from the last record to the clock."""
-    one = simulated()
-    one.go_on(10)
-    read = one.watch.read
+    watched = simulated()
+    watched.go_on(10)
+    read = watched.watch.read
 
     def held_up() -> None:
         read()
-        one.go_on(6, look=False)
+        watched.go_on(6, look=False)
 
-    incomplete = one.application.cycles["incomplete"]
+    incomplete = watched.application.cycles["incomplete"]
     with monkeypatch.context() as patch:
-        patch.setattr(one.watch, "read", held_up)
-        assert counted(one.watch.look())["incomplete"] <= incomplete
-    one.go_on(4)
-    assert counted(one.go_on(2)[-1])["incomplete"] <= one.application.cycles["incomplete"]
+        patch.setattr(watched.watch, "read", held_up)
+        assert counted(watched.watch.look())["incomplete"] <= incomplete
+    watched.go_on(4)
+    assert counted(watched.go_on(2)[-1])["incomplete"] <= watched.application.cycles["incomplete"]
 
 
 @pytest.mark.parametrize("every", [4, 20])
 def test_looks_that_come_late_count_all_cycles_and_the_recorder_has_those_of_the_last(
     simulated: "Callable[..., Simulated]", tmp_path: Path, every: int
 ) -> None:
-    one = simulated()
-    one.go_on(20)
+    watched = simulated()
+    watched.go_on(20)
     for _ in range(20 // every):
-        one.go_on(every, look=False)
-        one.watch.read()
-        before = one.watch._over_ns
-        seen = one.watch.look()
-    assert sum(counted(seen).values()) == pytest.approx(one.begun(seen), abs=2)
-    tables = one.watch.save(tmp_path / "flight").events
+        watched.go_on(every, look=False)
+        watched.watch.read()
+        before = watched.watch._over_ns
+        seen = watched.watch.look()
+    assert sum(counted(seen).values()) == pytest.approx(watched.begun(seen), abs=2)
+    tables = watched.watch.save(tmp_path / "flight").events
     first = min(int(tables[one]["time"][0]) for one in tables.keys() - events.CREATION)
-    since = min(one.application.now - 10 * SECOND, before)
+    since = min(watched.application.now - 10 * SECOND, before)
     assert since <= first < since + SECOND // 10
 
 
 def test_one_of_two_that_run_with_the_same_name_can_be_watched(
     simulated: "Callable[..., Simulated]",
 ) -> None:
-    one = simulated()
-    problem = look_at_two_that_run(one).chains[0].problem or ""
+    watched = simulated()
+    problem = look_at_two_that_run(watched).chains[0].problem or ""
     assert "(write /a1../a2../a_2@" in problem, (
         "of several nodes twice no way point alone is enough"
     )
-    running = one.application.running[2:6]
+    running = watched.application.running[2:6]
     nodes = [f"/a_{number}@{process.pid}" for number, process in enumerate(running, start=2)]
     topics = ["/a3", "/a4", "/a5"]
     points = [point for both in zip(nodes, topics, strict=False) for point in both]
-    one.watch = Watch(["..".join(("/a1", *points))], users=())
-    (named,) = one.go_on(10)[-1].chains
+    watched.watch = Watch(["..".join(("/a1", *points))], users=())
+    (named,) = watched.go_on(10)[-1].chains
     assert named.problem is None
     assert named.counted["complete"] > 100

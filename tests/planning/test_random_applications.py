@@ -13,6 +13,7 @@ ONCE_BROKEN = (
     427,  # received behind the outputs of other chains, which one executor serves as well
     1014,  # an eighth was discarded: the chain waits for a branch while another chain has its core
     5289,  # "late", all of them: LET per callback that counts from the cycle was judged by its gate
+    7446,  # once late, always late: its receivers ran while the next output was computed
 )
 
 

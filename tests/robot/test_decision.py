@@ -309,15 +309,14 @@ def test_of_each_kind_the_change_announced_last_holds(changes: list[tuple[int, s
             schedules = with_change(schedules, from_ns, moved_ns=value)
         else:
             schedules = with_change(schedules, from_ns, mode=str(value))
-    assert [one.from_ns for one in schedules] == sorted(one.from_ns for one in schedules)
+    beginnings = [schedule.from_ns for schedule in schedules]
+    assert beginnings == sorted(beginnings)
     for start_ns in range(10):
         wanted: dict[str, int] = {"phase_ns": 0, "moved_ns": 0, "mode": 0}
         wanted |= {what: value for from_ns, what, value in changes if from_ns <= start_ns}
-        found = schedule_in_force(schedules, start_ns)
-        assert (found.phase_ns, found.moved_ns, found.mode) == (
-            *(wanted["phase_ns"], wanted["moved_ns"]),
-            str(wanted["mode"]),
-        )
+        in_force = schedule_in_force(schedules, start_ns)
+        assert (in_force.phase_ns, in_force.moved_ns) == (wanted["phase_ns"], wanted["moved_ns"])
+        assert in_force.mode == str(wanted["mode"])
 
 
 def test_what_changes_nothing_adds_nothing_and_only_the_last_are_remembered() -> None:
@@ -334,9 +333,9 @@ def test_a_good_stamp_shows_where_cycles_start_until_a_phase_is_announced() -> N
     schedules = with_change((Schedule(0, phase_ns=0),), 200, moved_ns=5)
     schedules = with_change(schedules, 300, phase_ns=40)
     schedules = with_phase_seen(schedules, 7, arrival_ns=150)
-    assert [one.phase_ns for one in schedules] == [7, 7, 40]
+    assert [each.phase_ns for each in schedules] == [7, 7, 40]
     schedules = with_phase_seen(schedules, 8, arrival_ns=250)
-    assert [one.phase_ns for one in schedules] == [7, 8, 40]
+    assert [each.phase_ns for each in schedules] == [7, 8, 40]
     assert with_phase_seen(schedules, 8, arrival_ns=299) is schedules
 
 

@@ -47,7 +47,14 @@ def test_the_cpp_package_is_the_generic_one_but_for_what_names_its_type() -> Non
     for read_by_tools in ("CMakeLists.txt", "package.xml"):
         del files[read_by_tools]
     headers = ("gate_log", "guest", "handover", "node", "readiness", "schema", "shaper")
-    decisions = ("decision", "queue", "throttling", "words")  # of the native library
+    decisions = (
+        "decision",
+        "gate",
+        "queue",
+        "schedules",
+        "throttling",
+        "words",
+    )  # of the native library
     assert files.keys() == {
         *("src/shaping_node.cpp", "scripts/respawning"),
         *(f"include/chainshaper_shaping/{header}.hpp" for header in headers),

@@ -532,7 +532,7 @@ class _Puzzle:
                 raise
             names = ", ".join(self.tables[k].name for k in group)
             reason = f"no offsets were found at which {names} keep their slots apart"
-            remedy = "whether there are any, `pip install 'chainshaper[solvers]'` lets find out"
+            remedy = "`pip install 'chainshaper[solvers]'` to find out whether there are any"
             raise OperationError(f"{reason}: {_fullest(self.tables, group)}; {remedy}") from None
         model, cycles = cp_model.CpModel(), {k: self.tables[k].cycle_ns for k in group}
         offsets = {k: model.new_int_var(0, cycles[k] - 1, f"offset{k}") for k in group}

@@ -22,6 +22,7 @@ from chainshaper.planning.chain_plan import (
     Prediction,
     ReceiverPlace,
     ShapingNode,
+    publish_slots,
     revised,
     shaping_nodes,
 )
@@ -150,5 +151,18 @@ def _has_room(plan: ChainPlan, profile: Profile, time_ns: int) -> bool:
         return took_ns + gates_ns + len(nodes) * time_ns < period
     if plan.policy == "pipelined":  # its stages have that room
         return True
+    if _leaves_while_computing(plan) and work_ns >= plan.margin.epsilon_ns:
+        return False
     delivery_ns = 0 if profile.reception is None else profile.reception.longest_ns
     return time_ns < plan.margin.epsilon_ns or not _reaches_next_cycle(plan, time_ns + delivery_ns)
+
+
+def _leaves_while_computing(plan: ChainPlan) -> bool:
+    """Whether an output that is a cycle late leaves while the chain still computes the next one.
+
+    It does where bands begin before the longest latency. What its gate and its receivers take then
+    comes on top of the next instance's latency: beyond the margin, that output is late as well, and
+    so on for ever.
+    """
+    slots = publish_slots(plan)
+    return bool(slots) and slots[0][0] < plan.evidence.max_latency_ns

@@ -54,10 +54,15 @@ def schedule_in_force(schedules: Sequence[Schedule], start_ns: int) -> Schedule:
 
     The first one that is remembered holds in all cycles before it, too.
     """
-    for schedule in reversed(schedules):
-        if schedule.from_ns <= start_ns:
-            return schedule
-    return schedules[0]
+    return schedules[_place_in_force(schedules, start_ns)]
+
+
+def _place_in_force(schedules: Sequence[Schedule], start_ns: int) -> int:
+    """Return the place of the schedule of the cycle that starts at this time."""
+    for place in range(len(schedules) - 1, 0, -1):
+        if schedules[place].from_ns <= start_ns:
+            return place
+    return 0
 
 
 def with_change(
@@ -75,7 +80,7 @@ def with_change(
 
         >>> schedules = with_change((Schedule(0, phase_ns=7),), 200, moved_ns=10)
         >>> schedules = with_change(schedules, 100, phase_ns=50)
-        >>> [(one.from_ns, one.phase_ns, one.moved_ns) for one in schedules]
+        >>> [(each.from_ns, each.phase_ns, each.moved_ns) for each in schedules]
         [(0, 7, 0), (100, 50, 0), (200, 50, 10)]
     """
 
@@ -102,7 +107,7 @@ def with_phase_seen(schedules: Schedules, phase_ns: int, arrival_ns: int) -> Sch
     The schedule that is in force at the message's arrival gets it, and with it those later ones
     that took their phase over from that one.
     """
-    place = max(0, bisect_right([schedule.from_ns for schedule in schedules], arrival_ns) - 1)
+    place = _place_in_force(schedules, arrival_ns)
     before_ns = schedules[place].phase_ns
     if phase_ns == before_ns:
         return schedules

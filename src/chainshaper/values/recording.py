@@ -29,6 +29,7 @@ from chainshaper.values.files import (
     rename_output,
     write_whole,
 )
+from chainshaper.values.parquet import PackedColumns, is_packable, packed
 from chainshaper.values.yaml_file import wrong_values_refused
 
 INFO_FILE = "recording.json"
@@ -195,8 +196,11 @@ def _readable(file: Path) -> Iterator[Path]:
         raise InputError(f"{file}: {reason}; record the run again") from error
 
 
-def _checksum(content: bytes | memoryview) -> str:
-    return f"crc32:{zlib.crc32(content):08x}"
+def _checksum(*parts: bytes | memoryview) -> str:
+    checksum = 0
+    for part in parts:
+        checksum = zlib.crc32(part, checksum)
+    return f"crc32:{checksum:08x}"
 
 
 def event_counts(recording: Recording) -> pl.DataFrame:
@@ -300,10 +304,11 @@ def _write_parts(folder: Path, parts: Iterable[EventTables]) -> dict[str, str]:
         for part in parts:
             checksums |= {file: future.result() for file, future in writing.items()}
             writing = {}
+            columns = PackedColumns()
             for name, frame in part.items():
                 file = _next_file(folder / f"{name}.parquet", count[name], checksums)
                 count[name] += 1
-                writing[file] = threads.submit(_write_table, file, frame)
+                writing[file] = threads.submit(_write_table, file, frame, columns)
         checksums |= {file: future.result() for file, future in writing.items()}
     return {str(file.relative_to(folder)): checksum for file, checksum in checksums.items()}
 
@@ -320,15 +325,20 @@ def _next_file(file: Path, before: int, checksums: dict[Path, str]) -> Path:
     return file / f"{before:06}.parquet" if before else file
 
 
-def _write_table(file: Path, frame: pl.DataFrame) -> str:
-    """Write a file; return its checksum."""
-    content = io.BytesIO()  # Polars would report a full disk as a wrong file
-    frame.write_parquet(content, compression="zstd", compression_level=1, statistics=False)
+def _write_table(file: Path, frame: pl.DataFrame, columns: PackedColumns) -> str:
+    """Write a file; return its checksum. Tables of one part have ``columns`` in common."""
+    parts = packed(frame, columns) if is_packable(frame) else [_written_by_polars(frame)]
     with os.fdopen(open_output(file), "wb") as stream:
-        stream.write(content.getbuffer())
+        stream.writelines(parts)
         stream.flush()
         os.fsync(stream.fileno())
-    return _checksum(content.getbuffer())
+    return _checksum(*parts)
+
+
+def _written_by_polars(frame: pl.DataFrame) -> memoryview:
+    content = io.BytesIO()  # Polars would report a full disk as a wrong file
+    frame.write_parquet(content, compression="zstd", compression_level=1, statistics=False)
+    return content.getbuffer()
 
 
 State: TypeAlias = Literal["good", "limited", "absent"]

@@ -52,12 +52,16 @@ def name_of(pid: int) -> str:
     return text_of(read_proc(f"/proc/{pid}/comm").removesuffix(b"\n"))
 
 
-def left_out(pid: int, why: Exception) -> str:
-    """Return a sentence that names a process of which nothing is recorded."""
-    name = ""
+def left_out(pid: int, why: Exception, sent_name: str = "") -> str:
+    """Return a sentence that names a process of which nothing is recorded.
+
+    ``sent_name`` is what the process said that its program is called, for one that has ended.
+    """
+    name = sent_name
     with suppress(OSError):  # it has ended
-        name = f" ({name_of(pid)})"
-    return f"nothing of process {pid}{name} is recorded: {why}."
+        name = name_of(pid)
+    called = f" ({name})" if name else ""
+    return f"nothing of process {pid}{called} is recorded: {why}."
 
 
 def _memory_of(descriptor: Path, pid: int) -> TracedProcess | RefusedMemoryError | None:
