@@ -393,8 +393,8 @@ def _judging(
     def judged(seen: "Seen") -> "list[Judged]":
         nonlocal breaks, named_at, left
         broken = broken_limits(limits, seen)
-        new = [limit.text for limit in broken if (limit.where, limit.what) not in breaks]
-        breaks = {(limit.where, limit.what) for limit in broken}
+        new = [limit.text for limit in broken if (limit.where, limit.figure) not in breaks]
+        breaks = {(limit.where, limit.figure) for limit in broken}
         if new:
             out.say("; ".join(new))
             if left > 0:

@@ -76,7 +76,7 @@ RING = 1024
 RELEASED, BYPASSED, MEASURED = 32, 32 + RING, 32 + 2 * RING  # places of rings of numbers
 ASKED = 32 + 3 * RING  # place of the ring of changes that were asked for, of three numbers each:
 CHANGES = 64  # the room of that ring
-NEW_PHASE, NEW_MOVE = 0, 1  # what a change may be of
+NEW_PHASE, NEW_MOVE = 0, 1  # kinds of changes
 TOPIC = ASKED + 3 * CHANGES  # place of the output's name
 TOPIC_BYTES = 256
 PUBLISHING, STANDING_BY, PASSING, MOVING, ASKING = 0, 1, 2, 3, 4
@@ -148,13 +148,13 @@ class Change(NamedTuple):
     """A change of a gate's schedule that was asked for.
 
     * ``from_ns``: it is in force in cycles that start then or later (CLOCK_MONOTONIC).
-    * ``what``: :data:`NEW_PHASE`: where cycles start, or :data:`NEW_MOVE`: by how much slots are
+    * ``kind``: :data:`NEW_PHASE`: where cycles start, or :data:`NEW_MOVE`: by how much slots are
       moved from where the gate has them.
     * ``value``: that time (ns).
     """
 
     from_ns: int
-    what: int
+    kind: int
     value: int
 
 
@@ -274,7 +274,7 @@ class Page:
         """By how much another process has the slots moved."""
         if not self.is_locked(MOVING):
             return 0
-        moves = [change.value for change in self.asked() if change.what == NEW_MOVE]
+        moves = [change.value for change in self.asked() if change.kind == NEW_MOVE]
         return moves[-1] if moves else 0
 
     @property
@@ -358,7 +358,7 @@ class Turn:
         # How many changes were asked for at the last look. A phase that was asked for before is
         # that of another gate; a move is in force for as long as its process lives.
         self._asked = page["asked"]
-        self._moves_before = [change for change in page.asked() if change.what == NEW_MOVE]
+        self._moves_before = [change for change in page.asked() if change.kind == NEW_MOVE]
 
     @property
     def wait_s(self) -> float:
@@ -452,7 +452,7 @@ class Turn:
         if asked != self._asked:
             changes += self.page.asked(self._asked)
             self._asked = asked
-        self._has_moved = self._has_moved or any(change.what == NEW_MOVE for change in changes)
+        self._has_moved = self._has_moved or any(change.kind == NEW_MOVE for change in changes)
         is_following = self._has_moved and self.page.is_locked(MOVING)
         for from_ns, what, value in changes:
             if what == NEW_PHASE:

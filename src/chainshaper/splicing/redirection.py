@@ -29,7 +29,8 @@ MOST_LOOKS = 10  # looks for publishers, a second apart, while discovery has not
 UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # of an endpoint that was discovered before its node was (rmw)
 
 _DRY_RUN = "chainshaper_dry_run"
-_RULE = re.compile(r"(?:(\w+):(?!//|=))?(?:rostopic://)?([^:]+):=(.+)", re.DOTALL)
+# A remap rule: the node it is for, what it matches, and the new name.
+_REMAP_RULE = re.compile(r"(?:(\w+):(?!//|=))?(?:rostopic://)?([^:]+):=(.+)", re.DOTALL)
 _NOT_LOADED = (
     "no launch file has a container load {}, and its shaping node is a component (what `ros2 "
     "component load` loads cannot be redirected: load it in a launch file; if it is a process, "
@@ -170,7 +171,7 @@ def redirecting(
     added: list[tuple[int, str]] = []
     leads: dict[str, str] = {}
     for place, rule in enumerate(rules):
-        found = _RULE.fullmatch(rule)
+        found = _REMAP_RULE.fullmatch(rule)
         if found is None or found[1] not in (None, base) or found[2].startswith("__"):
             continue
         match = expanded(found[2], node)
@@ -291,7 +292,7 @@ def _places(words: Sequence[str]) -> Iterator[int]:
 
 def _of_rule(rules: Sequence[str], *kinds: str) -> str | None:
     """Return the name or namespace that rules give to every node of a process."""
-    matches = (_RULE.fullmatch(rule) for rule in rules)
+    matches = (_REMAP_RULE.fullmatch(rule) for rule in rules)
     targets = (match[3] for match in matches if match and not match[1] and match[2] in kinds)
     return next(targets, None)
 
