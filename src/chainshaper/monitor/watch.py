@@ -158,9 +158,9 @@ class Seen:
             values = {"cycles per second": f"{chain.rate_hz:.3f}"}
             for span, figures in chain.spans.items():
                 shown = (("p50", figures.percentiles_ns.get("50")), ("max", figures.max_ns))
-                for which, ns in shown:
+                for statistic, ns in shown:
                     if ns is not None:
-                        values[f"{which} of the last {span} [ms]"] = f"{ns / 1e6:.3f}"
+                        values[f"{statistic} of the last {span} [ms]"] = f"{ns / 1e6:.3f}"
             about = {"name": f"chainshaper: {chain.chain}", "level": level, "message": text}
             statuses.append({**about, "values": values})
         return statuses
@@ -224,8 +224,9 @@ class _Chain:
         begun = self.cycles.filter(pl.col("start") >= since_ns)
         whole = begun.drop_nulls("latency_ns")
         late = None if whole["late"].null_count() else int(whole["late"].sum())
-        gone = begun.height - whole.height
-        return latency_statistics(whole["latency_ns"].to_numpy(), incomplete=gone, late=late)
+        return latency_statistics(
+            whole["latency_ns"].to_numpy(), incomplete=begun.height - whole.height, late=late
+        )
 
     def worst_ns(self, since_ns: int) -> tuple[int, ...]:
         """The start of the worst cycle since an instant: without an output, or the longest."""
@@ -290,16 +291,15 @@ class Watch:
         ends = [(text, text.rpartition("..")[2]) for text in chains]
         self.chains = [_Chain(text, end, self._slots(end)) for text, end in ends]
         self.processes: dict[int, TracedProcess] = {}
-        self._left_out: dict[
-            int, str
-        ] = {}  # by pid, a sentence that says why nothing is seen of it
+        # By pid, a sentence that says why nothing is seen of it.
+        self._left_out: dict[int, str] = {}
         self._created: dict[int, tuple[int, dict[str, pl.DataFrame], TracingLibrary]] = {}
         self._fresh: list[tuple[int, NDArray[Any]]] = []  # pid and records, not yet in a table
         self._recent: deque[tuple[int, dict[str, pl.DataFrame]]] = deque()  # last instant, events
         self._latest: dict[int, int] = {}  # by pid, the time of its last event
         self._tabled_ns = 0
         self._stepped_ns = 0  # when CLOCK_REALTIME was set: cycles from before are unclear
-        self._known: list[tuple[Any, ...]] = []
+        self._basis: list[tuple[Any, ...]] = []  # of the objects below: see `_objects`
         self._resolved = resolve_objects({})
         self._clock_offset_ns = clock_offset()
         self._searched_ns = 0
@@ -330,8 +330,8 @@ class Watch:
             self._left_out = {
                 pid: reason for pid, reason in self._left_out.items() if _is_running(pid)
             }
-            known = {*self.processes, *self._left_out}
-            for pid, memory in memories(self.users, known, self._left_out.__setitem__):
+            followed = {*self.processes, *self._left_out}
+            for pid, memory in memories(self.users, followed, self._left_out.__setitem__):
                 self.processes[pid], self._latest[pid] = memory, 0
                 created, _ = memory.objects()
                 if created.size and created["time"][0] < self._began_ns:
@@ -453,14 +453,14 @@ class Watch:
         To resolve them is half of the work of a look. Objects of Python nodes become known only
         when a callback runs or a subscription takes, so these are compared, too.
         """
-        what_ran = [("callback_start", "callback"), ("rmw_take", "rmw_subscription_handle")]
-        known = [tuple(sorted((pid, created[0]) for pid, created in self._created.items()))]
-        for name, column in what_ran:
+        columns_of_runs = [("callback_start", "callback"), ("rmw_take", "rmw_subscription_handle")]
+        basis = [tuple(sorted((pid, created[0]) for pid, created in self._created.items()))]
+        for name, column in columns_of_runs:
             rows = events.table(tables, name).select("pid", column).unique()
-            known.append(tuple(sorted(rows.iter_rows())))
+            basis.append(tuple(sorted(rows.iter_rows())))
         times = (tables[name]["time"][-1] for name in events.CREATION & tables.keys())
-        if known != self._known or max(times, default=0) >= since_ns:
-            self._known, self._resolved = known, resolve_objects(tables)
+        if basis != self._basis or max(times, default=0) >= since_ns:
+            self._basis, self._resolved = basis, resolve_objects(tables)
         return self._resolved
 
     def _now(self, chain: _Chain, over_ns: int, moved: Mapping[str, int]) -> ChainNow:
@@ -496,8 +496,8 @@ class Watch:
     def _tables(self, since_ns: int) -> EventTables:
         """Events since an instant, and the creation of all objects but those of ended processes."""
         self._take_fresh(time.monotonic_ns())
-        gone = {pid for pid in self._ended() if self._latest[pid] < since_ns}
-        created = (tables for pid, (_, tables, _) in self._created.items() if pid not in gone)
+        silent = {pid for pid in self._ended() if self._latest[pid] < since_ns}
+        created = (tables for pid, (_, tables, _) in self._created.items() if pid not in silent)
         recent = (tables for last_ns, tables in self._recent if last_ns >= since_ns)
         return joined_tables([*created, *recent])
 
@@ -614,10 +614,10 @@ def exporting(
         until.callback(provider.shutdown, timeout_millis=LONGEST_END_MS)
         meter, last = provider.get_meter("chainshaper"), list[Seen]()
 
-        def observed(wanted: str, _options: object) -> Iterator[Any]:
+        def observed(metric: str, _options: object) -> Iterator[Any]:
             for seen in last:
                 for name, value, about in _values(seen):
-                    if name == wanted:
+                    if name == metric:
                         yield observation(value, about)
 
         for name, (kind, unit, about) in _METRICS.items():
@@ -646,10 +646,13 @@ def _values(seen: Seen) -> Iterator[tuple[str, float, dict[str, str]]]:
     for chain in seen.chains:
         named = {"chain": chain.chain}
         for span, figures in chain.spans.items():
-            percentiles = {f"p{which}": ns for which, ns in figures.percentiles_ns.items()}
-            for which, ns in {"min": figures.min_ns, "max": figures.max_ns, **percentiles}.items():
+            statistics = {"min": figures.min_ns, "max": figures.max_ns}
+            for percentile, ns in figures.percentiles_ns.items():
+                statistics[f"p{percentile}"] = ns
+            for statistic, ns in statistics.items():
                 if ns is not None:
-                    yield "chain.latency", ns / SECOND, {**named, "span": span, "statistic": which}
+                    about = {**named, "span": span, "statistic": statistic}
+                    yield "chain.latency", ns / SECOND, about
         for hop in chain.hops:
             about = {**named, "node": hop.node, "topic": hop.topic}
             for part in PARTS:

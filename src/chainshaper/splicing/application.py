@@ -169,9 +169,9 @@ def _spliced(application: Application, plan: ChainPlan, shaping: ShapingNode) ->
     nodes[shaping.name] = _described(plan, shaping, depth, timer.phase_ns)
     if shaping.output in topics:
         topics[shaping.input] = topics[shaping.output]  # the same quality of service
-    first, arrow, others = application.chain.partition("..")
+    first, arrow, rest = application.chain.partition("..")
     starts = arrow and first.strip() == shaping.output  # the chain begins with the same message
-    chain = f"{shaping.input}..{others}" if starts else application.chain
+    chain = f"{shaping.input}..{rest}" if starts else application.chain
     return application.model_copy(update={"nodes": nodes, "topics": topics, "chain": chain})
 
 

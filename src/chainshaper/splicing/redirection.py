@@ -137,9 +137,9 @@ class Redirect:
         if elsewhere:
             return f"nothing was redirected: {_names(elsewhere)} has another topic in place of it"
         if lacking:
-            what = "no node {} runs" if self.component is None else _NOT_LOADED
-            what = what.format(_names(lacking))
-            return f"nothing was redirected: {what}; started were {_names(self.others)}"
+            problem = "no node {} runs" if self.component is None else _NOT_LOADED
+            problem = problem.format(_names(lacking))
+            return f"nothing was redirected: {problem}; started were {_names(self.others)}"
         if self.kind == "subscription":
             past, does = [node for node in on_topic if node in self.nodes], "subscribes to"
         else:
@@ -171,14 +171,14 @@ def redirecting(
     added: list[tuple[int, str]] = []
     leads: dict[str, str] = {}
     for place, rule in enumerate(rules):
-        found = _REMAP_RULE.fullmatch(rule)
-        if found is None or found[1] not in (None, base) or found[2].startswith("__"):
+        parts = _REMAP_RULE.fullmatch(rule)
+        if parts is None or parts[1] not in (None, base) or parts[2].startswith("__"):
             continue
-        match = expanded(found[2], node)
+        match = expanded(parts[2], node)
         if match not in leads:
-            leads[match] = expanded(found[3], node)
+            leads[match] = expanded(parts[3], node)
             if leads[match] == topic:
-                added.append((place, f"{base}:{found[2]}:={target}"))
+                added.append((place, f"{base}:{parts[2]}:={target}"))
     if topic not in leads:
         added.append((len(rules), f"{base}:{topic}:={target}"))
     return added if added or target in leads.values() else None
@@ -423,9 +423,9 @@ def nodes_of(endpoints: Sequence[Any]) -> tuple[list[str], bool]:
 
     The second value says whether there are some whose node discovery has not found yet.
     """
-    known = [info for info in endpoints if info.node_name != UNKNOWN_NODE]
-    names = [f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in known]
-    return names, len(known) < len(endpoints)
+    with_node = [info for info in endpoints if info.node_name != UNKNOWN_NODE]
+    names = [f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in with_node]
+    return names, len(with_node) < len(endpoints)
 
 
 def _check(context: Any, redirects: Sequence[Redirect], looks: int = MOST_LOOKS) -> Any:

@@ -125,8 +125,8 @@ def write_shaping_process(
             "server_cores": sorted({server.core for server in plan.servers}),
             "log": "" if log is None else str(log.with_stem(name).absolute()),
         }
-        standby, others = _process("python", "standby", name, folder, of_standby, topics)
-        process, files = replace(process, standby=standby), files | others
+        standby, standby_files = _process("python", "standby", name, folder, of_standby, topics)
+        process, files = replace(process, standby=standby), files | standby_files
     _write(into or folder, files)
     return process
 

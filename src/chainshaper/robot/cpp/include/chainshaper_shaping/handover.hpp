@@ -260,7 +260,7 @@ public:
     return true;
   }
 
-  // Returns whether the standby has published this message, which waits behind the one that the
+  // Returns whether the standby has dealt with this message, which waits behind the one that the
   // node is about to publish: that one would come after it. To be called after `was_bypassed`.
   bool is_overtaken_by(std::int64_t key) const {
     return std::binary_search(bypassed_.begin(), bypassed_.end(), key);
