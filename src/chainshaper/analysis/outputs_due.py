@@ -55,7 +55,7 @@ def with_outputs_due(
 
 
 def _running_until(flow: DataFlow, until_ns: int | None) -> int:
-    """The instant until which every node ran, unless it ended by itself (ns)."""
+    """Return the instant until which every node ran, unless it ended by itself (ns)."""
     if until_ns is not None:
         return until_ns
     times = flow.instances["start"]
@@ -89,7 +89,7 @@ def not_begun(
 
 
 def _stays_behind(behind: npt.NDArray[np.int64], cycle_ns: int) -> npt.NDArray[np.int64]:
-    """By how many whole cycles each beginning, and the next ones, fall behind the one before."""
+    """Return by how many whole cycles each beginning, and all later ones, fall behind."""
     ahead = np.append(behind[1:], np.full(_CATCHES_UP, behind[-1]))
     least = np.lib.stride_tricks.sliding_window_view(ahead, _CATCHES_UP)[: len(behind) - 1]
     rise = least.min(axis=1) - behind[:-1]

@@ -489,7 +489,7 @@ def profile(
     threads are as before. What happened before the priorities were in force is left out, and is no
     part of --duration.
     """
-    from chainshaper.flow.profiling import check_profiling, profiled_cores, undelayed
+    from chainshaper.flow.profiling_condition import check_profiling, profiled_cores, undelayed
     from chainshaper.linux.own_processes import check_command
     from chainshaper.planning.request import best_effort_cores
     from chainshaper.values.recording import refuse_existing

@@ -127,7 +127,7 @@ class Judged:
 
     @property
     def text(self) -> str:
-        """In one line: ``/t1../t5: maximum 81.2ms, budget 80ms (only in disturbed cycles)``."""
+        """The limit in one line: ``/t1../t5: maximum 81.2ms, budget 80ms; from …``."""
         if self.measured is None:
             return f"{self.where}: {self.figure} could not be measured; {self.because}"
         measured, limit = self._value(self.measured), self._value(self.limit)
@@ -257,7 +257,7 @@ def _checked(
 
 
 def broken_limits(budget: Budget, seen: "Seen") -> list[Judged]:
-    """The limits of a budget that the last minute broke.
+    """Return the limits of a budget that the last minute broke.
 
     A chain or callback that has never run breaks none. Of a chain that has run before, and had no
     output in the last minute, all outputs are missing.
@@ -321,7 +321,7 @@ def _chain_limits(
 
 
 def _longest_parts(parts: pl.DataFrame) -> dict[str, dict[str, float | None]]:
-    """The longest communication, computation and waiting of each hop, by its topic."""
+    """Return the longest communication, computation and waiting of each hop, by its topic."""
     longest = (pl.col(f"{part}_ns").struct.field("max").alias(part) for part in PARTS)
     rows = parts.select("topic", *longest).iter_rows(named=True)
     return {row["topic"]: {part: row[part] for part in PARTS} for row in rows}
@@ -392,7 +392,7 @@ def _from_where(hops: Sequence[Judged], parts: pl.DataFrame) -> str | None:
 
 
 def junit_report(judged: "Sequence[Judged | Compared]") -> str:
-    """JUnit XML: a suite for each recording, a test case for each limit or callback."""
+    """Return JUnit XML: a suite for each recording, a test case for each limit or callback."""
     root = ElementTree.Element("testsuites", name="chainshaper check")
     for recording in dict.fromkeys(verdict.recording for verdict in judged):
         of_recording = [verdict for verdict in judged if verdict.recording == recording]
@@ -411,7 +411,7 @@ def junit_report(judged: "Sequence[Judged | Compared]") -> str:
 def markdown_report(
     judged: "Sequence[Judged | Compared]", words: tuple[str, str, str] = ("limits", "broken", "met")
 ) -> str:
-    """GitHub-flavoured Markdown for a pull request: what breaks, and how many limits are met.
+    """Return Markdown (GitHub's) for a pull request: what breaks, and how many limits are met.
 
     ``words`` are for what is judged, and for both verdicts.
     """

@@ -143,9 +143,10 @@ class Seen:
         return asdict(self)
 
     def as_diagnostics(self) -> list[dict[str, Any]]:
-        """A status for each chain, for :func:`~chainshaper.sources.ros.publishing_diagnostics`.
+        """Return a status for each chain, as `/diagnostics` has it.
 
-        ERROR: nothing was to be seen in the last minute. WARN: an output was late or never came.
+        ERROR: there was no output in the last minute. WARN: an output was late or never came. They
+        are for :func:`~chainshaper.sources.ros.publishing_diagnostics`.
         """
         statuses = []
         for chain in self.chains:
@@ -167,7 +168,7 @@ class Seen:
 
 
 _SAME = ("node", "kind", "topic", "declared_ns")
-"""A callback with the same is the same one, although its node was started again."""
+"""Two callbacks that agree in these are one callback, whose node was started again."""
 _CYCLE = pl.Schema(
     {"start": pl.Int64, "latency_ns": pl.Int64, "late": pl.Boolean, "place_ns": pl.Int64}
 )
@@ -220,7 +221,7 @@ class _Chain:
             self.hops.append((now_ns, figures))
 
     def statistics(self, since_ns: int) -> LatencyStatistics:
-        """Statistics over the cycles that began since an instant."""
+        """Return statistics over the cycles that began since an instant."""
         begun = self.cycles.filter(pl.col("start") >= since_ns)
         whole = begun.drop_nulls("latency_ns")
         late = None if whole["late"].null_count() else int(whole["late"].sum())
@@ -229,13 +230,13 @@ class _Chain:
         )
 
     def worst_ns(self, since_ns: int) -> tuple[int, ...]:
-        """The start of the worst cycle since an instant: without an output, or the longest."""
+        """Return the start of the worst cycle since an instant: without output, or the longest."""
         rows = self.cycles.filter(pl.col("start") >= since_ns)
         worst = rows.sort("latency_ns", descending=True, nulls_last=False, maintain_order=True)
         return tuple(worst["start"].head(1))
 
     def shares(self) -> tuple[tuple[float, ...], float]:
-        """The share of outputs within each slot, and that of those before the first one."""
+        """Return the share of outputs within each slot, and that of those before the first one."""
         places = self.cycles.drop_nulls("latency_ns")["place_ns"].drop_nulls().to_numpy()
         if not self.slots or not places.size:
             return (), 0.0
@@ -246,7 +247,7 @@ class _Chain:
         return tuple((counted / places.size).tolist()), float((slots < 0).mean())
 
     def beginning(self, graph: ApplicationGraph) -> Chain | None:
-        """The first callback as a chain, where the whole one was found once and is no longer."""
+        """Return the first callback as a chain, where the whole chain is no longer there."""
         if self.first is None:
             return None
         topic = self.names[0][1]
@@ -312,7 +313,7 @@ class Watch:
         return next((due for due in self.due if due.output in (None, output)), None)
 
     def _plan_of(self, output: str) -> ChainPlan | None:
-        """The plan whose promise is about a chain with this output."""
+        """Return the plan whose promise is about a chain with this output."""
         plans = () if self.plan is None else self.plan.chains
         return next((plan for plan in plans if plan.chain.output in (None, output)), None)
 
@@ -418,7 +419,7 @@ class Watch:
     def _judged(
         self, watched: _Chain, flow: DataFlow, graph: ApplicationGraph
     ) -> tuple[pl.DataFrame, pl.DataFrame] | None:
-        """The traversals of a chain, late ones marked, and their hops; None: it is in no graph.
+        """Return the judged traversals of a chain, and their hops; None: the chain is not there.
 
         Where only its beginning is in the graph, each cycle that began is incomplete.
         """
@@ -448,7 +449,7 @@ class Watch:
         return judged, traversals.hops
 
     def _objects(self, tables: EventTables, since_ns: int) -> Objects:
-        """The objects of all processes: those of the last look, if none can have come since.
+        """Return the objects of all processes: those of the last look, if none can have come since.
 
         To resolve them is half of the work of a look. Objects of Python nodes become known only
         when a callback runs or a subscription takes, so these are compared, too.
@@ -464,7 +465,7 @@ class Watch:
         return self._resolved
 
     def _now(self, chain: _Chain, over_ns: int, moved: Mapping[str, int]) -> ChainNow:
-        """The figures of a chain whose cycles until ``over_ns`` are counted."""
+        """Return the figures of a chain whose cycles until ``over_ns`` are counted."""
         moved_ns = moved.get(chain.output, 0)
         begun = chain.cycles["start"].filter(chain.cycles["start"] > over_ns - SPANS["minute"])
         shares, early = chain.shares()
@@ -494,7 +495,7 @@ class Watch:
         return running + self._lost_with_ended
 
     def _tables(self, since_ns: int) -> EventTables:
-        """Events since an instant, and the creation of all objects but those of ended processes."""
+        """Return events since an instant, and the creation of objects, without ended processes'."""
         self._take_fresh(time.monotonic_ns())
         silent = {pid for pid in self._ended() if self._latest[pid] < since_ns}
         created = (tables for pid, (_, tables, _) in self._created.items() if pid not in silent)
