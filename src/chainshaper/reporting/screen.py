@@ -154,7 +154,11 @@ def unplanned_lines(before: Measurement, reason: str) -> list[Text]:
 
 def verdict_lines(before: Measurement, after: Measurement) -> list[Text]:
     """Say whether the outputs were as planned, and what the machine did meanwhile."""
-    return [*_promise_lines(after), *_machine_lines(before, after)]
+    lines = [*_promise_lines(after), *_machine_lines(before, after)]
+    if False in (before.recording.info.realtime, after.recording.info.realtime):
+        text = "Not all threads had SCHED_FIFO: run it as root, or with an `rtprio` limit."
+        lines.append(_line("!", text))
+    return lines
 
 
 def _promise_lines(after: Measurement) -> list[Text]:
