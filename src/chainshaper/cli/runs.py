@@ -611,6 +611,7 @@ def shape(
     mode_profile: list[str] | None = opt.MODE_PROFILE,
     user: list[str] | None = opt.USERS,
     strict: bool = opt.STRICT,
+    verbose: bool = opt.option("--verbose", "Print all tables, too, and every note.", False),
     json: bool = opt.JSON,
 ) -> None:
     """Run an application with its output shaped as planned, and record it.
@@ -666,7 +667,7 @@ def shape(
             planned=out.warn,
             progress=out.stage_lines("shape"),
         )
-    _show_shaped_launch(shaped, strict=strict, json=json)
+    _show_shaped_launch(shaped, strict=strict, verbose=verbose, json=json)
 
 
 def _show_shaped_recording(recording: "cs.Recording", *, strict: bool) -> None:
@@ -686,20 +687,34 @@ def _show_shaped_recording(recording: "cs.Recording", *, strict: bool) -> None:
     judge(comparisons, strict=strict, json=False)
 
 
-def _show_shaped_launch(shaped: "cs.ShapedLaunch", *, strict: bool, json: bool) -> None:
+def _show_shaped_launch(
+    shaped: "cs.ShapedLaunch", *, strict: bool, verbose: bool, json: bool
+) -> None:
     """Show the comparison of a launched application's chains, and judge it."""
     from chainshaper.reporting.latency import comparison_json
+    from chainshaper.reporting.screen import comparison_lines
 
     values = comparison_json(shaped.comparison) | {
         "folder": str(shaped.folder),
         "chains": [comparison_json(comparison) for comparison in shaped.comparisons],
         "cores": dict(shaped.cores),
     }
-    tables = [table for comparison in shaped.comparisons for table in comparison_tables(comparison)]
-    if out.present(json, values, *tables):
-        out.notes(shaped.notes)
-        out.show_line(shaped.folder)
-    judge(shaped.comparisons, strict=strict, json=json)
+    if json:
+        out.print_json(values)
+    else:
+        if verbose:
+            out.show(*comparison_tables(*shaped.comparisons))
+            out.notes(shaped.notes)
+        for number, comparison in enumerate(shaped.comparisons, start=1):
+            results = shaped.folder if number == 1 else shaped.folder / f"chain_{number}"
+            out.show_line(f"  {comparison.chain}")
+            out.show(*comparison_lines(comparison))
+            out.show_line(f"\n  Look        {results / 'report.html'}")
+        if shaped.splicing is not None:
+            launch = next(iter(shaped.splicing.launch.values()))
+            plan = shaped.folder / "plan.yaml"
+            out.show_line(f"  Keep it so  chainshaper apply {plan} -- ros2 launch {launch}")
+    judge(shaped.comparisons, strict=strict, json=True)
 
 
 def _ask(graph: "ApplicationGraph", listed: "ChainEnumeration") -> str:

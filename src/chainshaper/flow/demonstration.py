@@ -4,7 +4,6 @@ Runs without and with the plan take turns, so that both meet the same machine: w
 can be compared. Where it stands still often, they go on for longer.
 """
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
@@ -13,7 +12,7 @@ from pathlib import Path
 from chainshaper.flow.described import shape_application
 from chainshaper.flow.plan import plan_recording
 from chainshaper.planning import Plan, PlanRequest, save_plan
-from chainshaper.reporting.latency import comparison_json
+from chainshaper.reporting.latency import write_comparison_json
 from chainshaper.reporting.page import write_report
 from chainshaper.values.errors import ChainshaperError, OperationError
 from chainshaper.values.files import folder_beside, write_whole
@@ -176,8 +175,7 @@ def _demonstrated(turns: _Turns, folder: Path) -> Demonstration:
         for name, runs in (("before", turns.before), ("after", turns.after))
     ]
     comparison = compare_recordings(joined)
-    figures = json.dumps(comparison_json(comparison), indent=2) + "\n"
-    write_whole(folder / "comparison.json", [figures.encode()])
+    write_comparison_json(comparison, folder)
     write_report([comparison], folder / "report.html")
     return Demonstration(folder, comparison.measurements[0], comparison, None, longer)
 
