@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import platform
 import shutil
 import signal
 import struct
@@ -114,7 +115,7 @@ def test_what_else_a_machine_lacks_is_named_with_the_remedy(
         ("6.8.0-45-generic", r"\(6.8.0-45-generic\) has no sched_ext: use Linux 6.12 or newer"),
         ("6.1", r"has no sched_ext: use Linux 6.12"),
     ):
-        monkeypatch.setattr(scx.platform, "release", lambda release=release: release)
+        monkeypatch.setattr(platform, "release", lambda release=release: release)
         with pytest.raises(PlatformError, match=reason):
             scx.create(TABLE)
 

@@ -54,7 +54,7 @@ class _PlainGroup(TyperGroup):
     def get_help(self, ctx: Any) -> str:
         return _as_shown(super().get_help(ctx))
 
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002 - Click calls it so
         for title, verbs in GROUPS.items():
             commands = [(verb, self.commands[verb]) for verb in verbs.split()]
             with formatter.section(title):
