@@ -3,6 +3,15 @@
 # Where it is set, as images of containers like to, every process of a test compiles all it imports.
 export PYTHONDONTWRITEBYTECODE =
 
+# The library is built for each Python, for colcon, and for this .venv: what these builds have in
+# common is compiled once where ccache is installed.
+ccache := $(shell command -v ccache)
+ifneq ($(ccache),)
+export CMAKE_C_COMPILER_LAUNCHER = $(ccache)
+export CMAKE_CXX_COMPILER_LAUNCHER = $(ccache)
+export CCACHE_DIR = $(CURDIR)/build/ccache
+endif
+
 .PHONY: demo test test-untimed test-timed test-waiting test-kernel core-tests lint benchmark experiments docs clean
 
 demo: .venv/.ready
@@ -11,9 +20,10 @@ demo: .venv/.ready
 # Tests that need the machine's cores for themselves, and beside them those that mostly wait for
 # tracers and other programs, all others, which leave the cores to these (tests/conftest.py), the C++
 # library's own, and what looks at the code. What had to be tried twice stands at the end.
-test: .venv/.ready-dev
+test:
 	scripts/test-tools
 	rm -rf build/tried
+	$(MAKE) .venv/.ready-dev
 	$(MAKE) --jobs=5 --output-sync=line lint core-tests test-untimed test-timed test-waiting; \
 		code=$$?; scripts/run-tests --tried-twice; exit $$code
 
