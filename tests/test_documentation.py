@@ -2,8 +2,8 @@
 
 Commands stand in ``console`` blocks behind ``$``. All blocks of one page run in one folder, in
 order, because later ones use what earlier ones made. Runs are shortened; the verbs are called in
-this process, which has them loaded; live runs of the same example are recorded once for all pages;
-and what a clone compiles to be installed is not optimized. Nothing else differs.
+this process, which has them loaded; and live runs of the same example are recorded once for all
+pages. Nothing else differs.
 
 A machine that is busy with others' work disturbs nearly every one of so few cycles at times, and
 there is no planning from what is left. What failed is therefore tried again from its beginning, in
@@ -119,7 +119,6 @@ def finished_of(command: str, folder: Path) -> Finished:
             return called(*words)
     binaries = Path(sys.executable).parent
     environment = {**os.environ, "PATH": f"{binaries}{os.pathsep}{os.environ['PATH']}"}
-    environment["SKBUILD_CMAKE_BUILD_TYPE"] = "None"  # of a clone that is installed
     done = subprocess.run(
         ["sh", "-c", command], cwd=folder, env=environment, capture_output=True, text=True,
         check=False,

@@ -16,8 +16,7 @@ ROOT = Path(__file__).parents[2]
 def built_for_arm64() -> Path:
     """The folder with the libraries that stand in front of ROS 2, for arm64.
 
-    It is one of this checkout, in which CMake compiles only what has changed since. The library
-    behind `chainshaper._core`, which nobody runs there, has to compile: without being optimized.
+    It is one of this checkout, in which CMake compiles only what has changed since.
     """
     for compiler in ("aarch64-linux-gnu-gcc", "aarch64-linux-gnu-g++"):
         if shutil.which(compiler) is None:
@@ -26,7 +25,6 @@ def built_for_arm64() -> Path:
     assert cmake is not None, "scripts/setup has installed it"
     folder = ROOT / "build/arm64"
     options = ["-DCHAINSHAPER_BINDINGS=OFF", f"-DPython_EXECUTABLE={sys.executable}"]
-    options += ["-DCMAKE_BUILD_TYPE=None"]
     toolchain = f"-DCMAKE_TOOLCHAIN_FILE={ROOT / 'core/toolchains/arm64.cmake'}"
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("w") as lock:  # the tests run in several processes

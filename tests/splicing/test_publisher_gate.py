@@ -225,7 +225,8 @@ def test_tracers_see_a_node_behind_the_publisher_which_waits_for_nothing(
     run: Callable[..., Run],
 ) -> None:
     times = [n * 100 * MS + 20 * MS for n in range(4)]
-    done = run({"/t5": SLOT}, [at(ns, stamp=ns - 20 * MS) for ns in times] + [at(10 * MS, 0)])
+    lines = [at(ns, stamp=ns - 20 * MS) for ns in times] + [at(10 * MS, 0)]
+    done = run({"/t5": SLOT}, lines, on_time=True)
     assert done.written() == [1, 2, 3, 4]
     assert [line[2] for line in done.of("typed", "/other")] == ["0"]
     # Handing over is nothing beside the 40 ms for which each message waits.
@@ -445,7 +446,7 @@ def test_its_receivers_get_an_output_at_a_constant_time_behind_it_but_wait_no_lo
     block = settings_text(
         {"output": "/t5", "delivery_ns": DELIVERY_NS, "receiver": ["/x", "/sink"]}
     )
-    done = run({}, lines, deliveries=block)
+    done = run({}, lines, deliveries=block, on_time=True)
     handed = [(int(line[2]), int(line[3])) for line in done.of("handed", "0")]
     behind = [
         at - (ns - age) - DELIVERY_NS for (_, at), (ns, age) in zip(handed, taken, strict=False)
@@ -505,7 +506,8 @@ def test_its_output_is_shown_and_its_slots_move_while_they_are_followed(
         latencies.extend(followed.latencies())
         followed.close()
 
-    done = run({"/t5": SLOT}, [at(ns, stamp=ns - 20 * MS) for ns in times], follow)
+    lines = [at(ns, stamp=ns - 20 * MS) for ns in times]
+    done = run({"/t5": SLOT}, lines, follow, on_time=True)
     assert [one.state for one in seen] == ["in process"]
     before, after = (sum(row["release"] < ns for row in done.logs["/t5"]) for ns in looked)
     assert before - 1 <= seen[0].published <= after  # the last may have been on its way
