@@ -5,7 +5,7 @@ export PYTHONDONTWRITEBYTECODE =
 
 # The library is built for each Python, for colcon, and for this .venv: what these builds have in
 # common is compiled once where ccache is installed.
-ccache := $(shell command -v ccache)
+ccache := $(shell which ccache)
 ifneq ($(ccache),)
 export CMAKE_C_COMPILER_LAUNCHER = $(ccache)
 export CMAKE_CXX_COMPILER_LAUNCHER = $(ccache)
