@@ -6,9 +6,11 @@ are C++ (core/ctf), and run on several threads; of a large trace only some chunk
 once.
 """
 
+import mmap
 import os
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,8 @@ _CHUNK_BYTES = 32 << 20
 _SMALL_BYTES = 4 << 20
 _LARGE_BYTES = 512 << 20
 _HUGE_PAGE = 2 << 20
+_LARGE_COLUMN = 4 * _HUGE_PAGE
+_PAGE = 4096
 _MOST_WARNINGS = 20
 _FAILURES = {
     _core.CtfFailure.OTHER_TIME: "an event outside the time that its packet says it was open",
@@ -240,8 +244,9 @@ def _filled(
 class _Columns:
     """The arrays of one table of so many ``rows``: time, cpu (or nothing) and its columns' values.
 
-    They are parts of one piece of memory, large enough for huge pages: page faults would else be a
-    third of all work.
+    Large ones have memory of their own, so that a frame that is made of some of them keeps no
+    others. The small ones of a table are parts of one piece of memory, large enough for huge pages:
+    page faults would else be a third of all work.
     """
 
     def __init__(self, number: int, table: Table, rows: int) -> None:
@@ -251,12 +256,20 @@ class _Columns:
         wanted += [(rows, kind) for kind in table.column_types()]
         # Columns side by side must not begin alike in their pages, or they would compete for
         # the same few lines of the processor's cache.
-        sizes = [-(-count * kind.itemsize // 4096) * 4096 + 320 for count, kind in wanted]
-        parts = np.split(_memory(sum(sizes)), np.cumsum(sizes))
-        self.time, self.cpu, *self.values = (
-            part[: count * kind.itemsize].view(kind)
-            for part, (count, kind) in zip(parts, wanted, strict=False)
-        )
+        starts = [320 * place % _PAGE for place in range(len(wanted))]
+        sizes = [
+            start + -(-count * kind.itemsize // _PAGE) * _PAGE
+            for start, (count, kind) in zip(starts, wanted, strict=True)
+        ]
+        shared = _memory(sum(size for size in sizes if size < _LARGE_COLUMN))
+        arrays = []
+        for start, size, (count, kind) in zip(starts, sizes, wanted, strict=True):
+            if size < _LARGE_COLUMN:
+                memory, shared = shared[:size], shared[size:]
+            else:
+                memory = _memory(size)
+            arrays.append(memory[start : start + count * kind.itemsize].view(kind))
+        self.time, self.cpu, *self.values = arrays
 
     def arrays(self) -> _core.CtfTable:
         """The arrays for the decoder to write to."""
@@ -292,12 +305,17 @@ class _Columns:
 
 
 def _memory(size: int) -> NDArray[np.uint8]:
-    """Bytes of any content; many of them fill huge pages, which NumPy asks for, from end to end."""
+    """Bytes of any content, in huge pages where there are many.
+
+    They go back to the system with the last array that has a part of them; `malloc` would keep
+    what it has once let go.
+    """
     if size < 2 * _HUGE_PAGE:
         return np.empty(size, np.uint8)
-    memory = np.empty((size // _HUGE_PAGE + 2) * _HUGE_PAGE, np.uint8)
-    first = -memory.ctypes.data % _HUGE_PAGE
-    return memory[first : first + size]
+    memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    with suppress(OSError):  # a kernel without huge pages
+        memory.madvise(mmap.MADV_HUGEPAGE)
+    return np.frombuffer(memory, np.uint8)
 
 
 def _frames(columns: list[_Columns], known: list[bytes]) -> dict[str, pl.DataFrame]:
@@ -306,7 +324,6 @@ def _frames(columns: list[_Columns], known: list[bytes]) -> dict[str, pl.DataFra
     categories = strings.cast(pl.Categorical)
     parts: dict[str, list[pl.DataFrame]] = {}
     while columns:
-        # Arrays are let go one table at a time: Polars has copies of its own.
         table = columns.pop(0)
         parts.setdefault(table.table.name, []).append(table.frame(known, strings, categories))
     frames: dict[str, pl.DataFrame] = {}
