@@ -400,14 +400,13 @@ def _consumed(taken: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
     thread_callback = ["tid", "callback_id"]
     for through_buffer in (False, True):
         same = pl.col("intra_process") == through_buffer
-        began = instances.filter(same & ~pl.col("assumed")).select(
-            *thread_callback, "instance", "start"
-        )
-        received = taken.filter(same).select(*thread_callback, "take", took="time")
+        starts = instances.lazy().filter(same & ~pl.col("assumed"))
+        began = starts.select(*thread_callback, "instance", "start").collect()
+        of_kind = taken.lazy().filter(same)
+        received = of_kind.select(*thread_callback, "take", took="time").collect()
         if began.height and received.height:
-            read = latest_before(began, received, thread_callback, "start", "took").drop_nulls(
-                "take"
-            )
+            read = latest_before(began, received, thread_callback, "start", "took")
+            read = read.select("take", "instance").drop_nulls("take")
             # Of several instances after one take the first read the message. Of several rows with
             # one number `by_number` takes the last, so the order of starts is reversed.
             instance_of_take = by_number(read.reverse(), "take", "instance", taken.height)
@@ -448,8 +447,8 @@ def _published_in(
     """
     nodes = objects.callbacks.unique("callback_id", maintain_order=True)
     nodes = nodes.select("callback_id", owner=pl.col("node").cast(published.schema["node"]))
-    running = instances.join(nodes, on="callback_id", how="left", maintain_order="left")
-    running = running.drop("execution_ns", "intra_process")
+    running = instances.drop("execution_ns", "intra_process")
+    running = running.join(nodes, on="callback_id", how="left", maintain_order="left")
     key, columns = ["pid", "tid"], ["publication", "instance", "callback_id"]
     over_by = pl.coalesce("end", "until")
     lies_inside = (over_by.is_null() | (pl.col("time") <= over_by)) & (
@@ -458,8 +457,9 @@ def _published_in(
     left_over, parts, strictly = published.select("publication", "time", *key, "node"), [], True
     while True:
         matches = latest_before(left_over, running, key, "time", "start", strictly=strictly)
-        matches = matches.filter(lies_inside.fill_null(False) & pl.col("instance").is_not_null())
-        parts.append(matches.select(columns))
+        is_match = lies_inside.fill_null(False) & pl.col("instance").is_not_null()
+        matches = matches.lazy().filter(is_match).select(columns).collect()
+        parts.append(matches)
         instance_of = by_number(matches, "publication", "instance", published.height)
         left_over = left_over.filter(instance_of.gather(left_over["publication"]).is_null())
         # The first search is for instances that began before the publication, the second among the
