@@ -78,22 +78,21 @@ void merge(const Stamp * left, const Stamp * middle, const Stamp * end, Stamp * 
   const auto * right = middle;
   const auto * last_left = middle - 1;
   const auto * last_right = end - 1;
-  auto * last_to = to + (end - left) - 1;
+  std::ptrdiff_t first = 0, behind_last = end - left;  // of `to`, what is not filled yet
   // So many steps from either end cannot come to the end of a run.
   for (auto steps = std::min(middle - left, end - middle); steps > 0; --steps) {
     const bool takes_right = right->time_ns < left->time_ns;
-    *to++ = takes_right ? *right : *left;
+    to[first++] = takes_right ? *right : *left;
     right += static_cast<std::ptrdiff_t>(takes_right);
     left += static_cast<std::ptrdiff_t>(!takes_right);
     const bool takes_left = last_right->time_ns < last_left->time_ns;
-    *last_to-- = takes_left ? *last_left : *last_right;
+    to[--behind_last] = takes_left ? *last_left : *last_right;
     last_left -= static_cast<std::ptrdiff_t>(takes_left);
     last_right -= static_cast<std::ptrdiff_t>(!takes_left);
   }
   while (left <= last_left && right <= last_right)
-    *to++ = right->time_ns < left->time_ns ? *right++ : *left++;
-  to = std::copy(left, last_left + 1, to);
-  std::copy(right, last_right + 1, to);
+    to[first++] = right->time_ns < left->time_ns ? *right++ : *left++;
+  std::copy(right, last_right + 1, std::copy(left, last_left + 1, to + first));
 }
 
 // Merges runs of stamps, two by two, until there is one; `bounds` are where they begin and end.

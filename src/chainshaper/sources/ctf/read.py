@@ -31,6 +31,9 @@ _LARGE_BYTES = 512 << 20
 _HUGE_PAGE = 2 << 20
 _LARGE_COLUMN = 4 * _HUGE_PAGE
 _PAGE = 4096
+_APART = 320
+"""Columns side by side must not begin alike in their pages, or they would compete for the same few
+lines of the processor's cache: each begins so many bytes further than the one before it."""
 _MOST_WARNINGS = 20
 _FAILURES = {
     _core.CtfFailure.OTHER_TIME: "an event outside the time that its packet says it was open",
@@ -123,8 +126,9 @@ def read_events(
             for number, table in enumerate(wanted.tables)
         ]
         texts = _filled(pool, files, first_rows, columns, progress)
+        parts = _parts(pool, columns, texts)
     try:
-        events = Events(_frames(columns, texts))
+        events = Events(_frames(parts))
     except pl.exceptions.PolarsError as error:
         reason = f"events of one name have fields of types that do not fit together: {error}"
         folder = trace.folders[0].path
@@ -254,21 +258,15 @@ class _Columns:
         wanted: list[tuple[int, np.dtype[Any]]] = [(rows, np.dtype("i8"))]
         wanted += [(rows * table.has_cpu, np.dtype("i4"))]
         wanted += [(rows, kind) for kind in table.column_types()]
-        # Columns side by side must not begin alike in their pages, or they would compete for
-        # the same few lines of the processor's cache.
-        starts = [320 * place % _PAGE for place in range(len(wanted))]
-        sizes = [
-            start + -(-count * kind.itemsize // _PAGE) * _PAGE
-            for start, (count, kind) in zip(starts, wanted, strict=True)
-        ]
+        sizes = [-(-count * kind.itemsize // _PAGE) * _PAGE + _APART for count, kind in wanted]
         shared = _memory(sum(size for size in sizes if size < _LARGE_COLUMN))
         arrays = []
-        for start, size, (count, kind) in zip(starts, sizes, wanted, strict=True):
+        for place, (size, (count, kind)) in enumerate(zip(sizes, wanted, strict=True)):
             if size < _LARGE_COLUMN:
                 memory, shared = shared[:size], shared[size:]
             else:
-                memory = _memory(size)
-            arrays.append(memory[start : start + count * kind.itemsize].view(kind))
+                memory = _returned_memory(place * _APART + size)[place * _APART :]
+            arrays.append(memory[: count * kind.itemsize].view(kind))
         self.time, self.cpu, *self.values = arrays
 
     def arrays(self) -> _core.CtfTable:
@@ -305,27 +303,41 @@ class _Columns:
 
 
 def _memory(size: int) -> NDArray[np.uint8]:
-    """Bytes of any content, in huge pages where there are many.
-
-    They go back to the system with the last array that has a part of them; `malloc` would keep
-    what it has once let go.
-    """
+    """Bytes of any content; many of them fill huge pages, which NumPy asks for, from end to end."""
     if size < 2 * _HUGE_PAGE:
         return np.empty(size, np.uint8)
+    memory = np.empty((size // _HUGE_PAGE + 2) * _HUGE_PAGE, np.uint8)
+    first = -memory.ctypes.data % _HUGE_PAGE
+    return memory[first : first + size]
+
+
+def _returned_memory(size: int) -> NDArray[np.uint8]:
+    """Zeros in huge pages, which the system gets back with the last array that has a part of them.
+
+    NumPy's memory is `malloc`'s, which keeps what it has once let go.
+    """
     memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     with suppress(OSError):  # a kernel without huge pages
         memory.madvise(mmap.MADV_HUGEPAGE)
     return np.frombuffer(memory, np.uint8)
 
 
-def _frames(columns: list[_Columns], known: list[bytes]) -> dict[str, pl.DataFrame]:
+def _parts(
+    pool: ThreadPoolExecutor, columns: list[_Columns], known: list[bytes]
+) -> dict[str, list[pl.DataFrame]]:
+    """Event → the frames of its tables; codes of texts are of what is ``known``."""
     texts = [text.decode(errors="backslashreplace") for text in known]
     strings = pl.Series("", texts or [""], dtype=pl.String)
     categories = strings.cast(pl.Categorical)
     parts: dict[str, list[pl.DataFrame]] = {}
-    while columns:
-        table = columns.pop(0)
-        parts.setdefault(table.table.name, []).append(table.frame(known, strings, categories))
+    frames = pool.map(lambda table: table.frame(known, strings, categories), columns)
+    for table, frame in zip(columns, frames, strict=True):
+        parts.setdefault(table.table.name, []).append(frame)
+    return parts
+
+
+def _frames(parts: dict[str, list[pl.DataFrame]]) -> dict[str, pl.DataFrame]:
+    """One frame for each event, ordered by name."""
     frames: dict[str, pl.DataFrame] = {}
     for name in sorted(parts):
         frame = pl.concat(parts[name], how="diagonal_relaxed", rechunk=True)
