@@ -276,7 +276,7 @@ def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> p
     )
     if frame["callback_id"].null_count():
         frame = frame.drop_nulls("callback_id")
-    if frame["execution_ns"].null_count() == frame.height and "sched_switch" in tables:
+    if "sched_switch" in tables and not frame["execution_ns"].count():
         frame = _plausible(frame.with_columns(execution_ns=cpu_time(tables, frame)))
     return frame.with_row_index("instance")
 
