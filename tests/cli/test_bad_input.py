@@ -16,6 +16,7 @@ from command_line import called, chainshaper, message_of, refused
 from reference_traces import DATA
 from small_chain import small_chain_plan, small_chain_text
 
+from chainshaper.cli import main
 from chainshaper.planning import ChainPlan, Plan, save_plan
 from chainshaper.planning.shaping import server_per_chain
 from chainshaper.values.recording import Recording
@@ -285,16 +286,31 @@ def test_a_recording_whose_plan_is_none_is_refused(
     assert said.count("\n") == 1
 
 
-@pytest.mark.parametrize("megabytes", [100, 400, 650])
+def test_a_file_that_no_memory_is_left_for_is_not_called_damaged(
+    monkeypatch: pytest.MonkeyPatch, simulated: Recording, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def no_thread(*_: object, **__: object) -> None:
+        raise pl.exceptions.ComputeError("OS can't spawn worker thread: Resource unavailable")
+
+    monkeypatch.setattr(pl, "scan_parquet", no_thread)
+    with pytest.raises(SystemExit) as ended:
+        main(["latency", str(simulated.path)])
+    assert ended.value.code == 1
+    assert capsys.readouterr().err.startswith("error: memory ran out (")
+
+
+@pytest.mark.parametrize("megabytes", [100, 250, 400, 650])
 def test_limited_memory_ends_in_one_message_whoever_wanted_more(
     megabytes: int, simulated: Recording
 ) -> None:
-    limited = ("sh", "-c", f'ulimit -v {megabytes * 1000}; exec "$@"', "sh")
+    limited = ("sh", "-c", f'ulimit -v {megabytes * 1000_000 // 1024}; exec "$@"', "sh")
     finished = chainshaper("latency", simulated.path, prefix=limited)
     assert "Traceback" not in finished.err
-    if finished.code == 0 and megabytes > 100:  # it needs less than that since nothing is compiled
+    if finished.code == 0 and megabytes > 250:  # it needs less than that since nothing is compiled
         assert "End-to-end latency" in finished.out
         return
+    if megabytes == 250:
+        assert "and loading tables takes 400 MB" in finished.err
     # OpenBLAS ends the process by itself, with its own message.
     last = finished.err.strip().splitlines()[-1]
     assert finished.code == 1

@@ -112,3 +112,21 @@ def test_a_signal_while_the_interpreter_ends_leaves_no_traceback(number: signal.
     run = subprocess.run(command, capture_output=True, check=False)
     assert (run.returncode, run.stderr) == (-number, b"")
     assert run.stdout.startswith(b"chainshaper "), "it was done"
+
+
+def test_a_signal_in_a_callback_that_raises_nothing_ends_a_verb_all_the_same() -> None:
+    """Python prints what is raised in one, and goes on: the signal is repeated behind it."""
+    program = (
+        "import signal, sys, time\n"
+        "import chainshaper.__main__ as entry\n"
+        "class Dying:\n"
+        "    def __del__(self): signal.raise_signal(signal.SIGTERM)\n"
+        "def verb(*_, **__):\n"
+        "    Dying()\n"
+        "    time.sleep(100)\n"
+        "import chainshaper.cli.app as cli\n"
+        "cli.app = verb\n"
+        "entry.main()\n"
+    )
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
+    assert (run.returncode, run.stderr) == (130, b"")

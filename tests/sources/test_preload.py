@@ -39,6 +39,8 @@ from chainshaper.sources.preload import (
     installed_library,
     memories,
     preloading,
+    running,
+    tracer,
 )
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
@@ -328,7 +330,30 @@ def test_a_process_of_another_clock_is_refused_and_named(tmp_path: Path, ahead_s
     assert taken(found) == list(range(5))
     (note,) = (one for one in found.info.notes if one.startswith("nothing of process"))
     assert "another clock, that of a time namespace" in note
-    assert re.match(r"nothing of process \d+ \(python[\d.]*\) is recorded: ", note), "or its end"
+    assert re.match(r"nothing of process \d+ \(python[\d.]*\) is recorded: ", note)
+
+
+def test_a_process_that_has_ended_before_it_was_looked_at_is_named_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its program's name comes with its memory: `/proc` has forgotten it."""
+
+    def forgotten(pid: int) -> str:
+        raise ProcessLookupError(pid)
+
+    monkeypatch.setattr(tracer, "name_of", forgotten)
+    monkeypatch.setattr(running, "name_of", forgotten)
+    command = in_time_namespace(100_000, sys.executable, "-c", CALLER + "take(99)")
+
+    def run() -> list[list[str]]:
+        python("take(1)")
+        subprocess.run(command, check=True, timeout=60)
+        return []
+
+    recorded = traced(tracer_of(tmp_path), run)
+    (note,) = (note for note in recorded.info.notes if note.startswith("nothing of process"))
+    assert re.match(r"nothing of process \d+ \(python[\d.]*\) is recorded: ", note)
+    assert [name for name in recorded.info.processes.values() if name.startswith("python")]
 
 
 TAKES_A_LINE = """

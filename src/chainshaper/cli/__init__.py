@@ -27,6 +27,7 @@ _LACK_OF_MEMORY = (
     "failed to map segment",  # the loader, of a library
     "can't start new thread",
     "could not spawn threads",
+    "can't spawn worker thread",
     "capacity overflow",
 )
 # Environment variables with which libraries start as few threads as they can.
@@ -48,6 +49,8 @@ _PLAIN = {
     "×": "x",
     "≤": "<=",
 }
+_LEAST_FOR_TABLES = 400_000_000
+"""Bytes of address space below which Polars, as it loads, hangs or dies where it should say so."""
 _handlers: list[Any] = []  # ctypes forgets a callback that nothing refers to
 
 
@@ -61,6 +64,8 @@ def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
         for number in _ENDING:
             if signal.getsignal(number) is _end_in_order:
                 signal.signal(number, signal.SIG_DFL)
+        if sys.unraisablehook is _ask_again:
+            sys.unraisablehook = sys.__unraisablehook__
 
 
 def _run(arguments: list[str] | None, name: str) -> None:
@@ -84,6 +89,7 @@ def _run(arguments: list[str] | None, name: str) -> None:
             # As chainshaper.__main__ does for Ctrl-C; a signal that nohup ignores stays ignored.
             if signal.getsignal(number) == signal.SIG_DFL:
                 signal.signal(number, _end_in_order)
+                sys.unraisablehook = _ask_again
         from chainshaper.cli.app import USAGE_ERROR, Abort, app
 
         try:
@@ -96,6 +102,9 @@ def _run(arguments: list[str] | None, name: str) -> None:
             say("Aborted.")
             sys.exit(1)
     except ChainshaperError as error:
+        message = _exhausted(error)  # a file that no memory is left for is no damaged one
+        if message is not None:
+            fail(message, 1)
         fail(str(error), error.exit_code)
     except PermissionError as error:
         remedy = "name a place that you may read and write, or change its permissions"
@@ -127,6 +136,22 @@ def _end_in_order(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
     """End the process on Ctrl-C, SIGTERM or a lost terminal alike: through every `finally`."""
     _interrupted.append(number)
     raise KeyboardInterrupt
+
+
+def _ask_again(ignored: "sys.UnraisableHookArgs") -> None:
+    """Repeat a signal that came in a callback from which Python lets nothing be raised.
+
+    There are such in imports and in libraries: Python would print the KeyboardInterrupt, and go on.
+    """
+    if not (_interrupted and issubclass(ignored.exc_type, KeyboardInterrupt)):
+        sys.__unraisablehook__(ignored)
+        return
+    import threading
+
+    main_thread = threading.main_thread().ident
+    soon = threading.Timer(0.01, signal.pthread_kill, (main_thread, _interrupted[-1]))
+    soon.daemon = True
+    soon.start()
 
 
 def _exhausted(error: BaseException | None) -> str | None:
@@ -163,6 +188,20 @@ def _readable(error: UnicodeError) -> tuple[str | bytes, int]:
     return plain, error.end
 
 
+class _NoRoomForTables:
+    """Refuses to load Polars where memory is limited to less than it takes to load."""
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+
+    def find_spec(self, fullname: str, path: object, target: object = None) -> None:  # noqa: ARG002 - as Python calls it
+        if fullname == "polars":
+            raise MemoryError(
+                f"it is limited to {self.limit // 10**6} MB, and loading tables takes "
+                f"{_LEAST_FOR_TABLES // 10**6} MB of address space"
+            )
+
+
 def _prepare_output_and_memory() -> None:
     """Let output be shown by any terminal; where memory is limited (`ulimit -v`), spare it.
 
@@ -174,8 +213,11 @@ def _prepare_output_and_memory() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="readable")
-    if resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY:
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit == resource.RLIM_INFINITY:
         return
+    if limit < _LEAST_FOR_TABLES:
+        sys.meta_path.insert(0, _NoRoomForTables(limit))
     for name, value in _FEW_THREADS.items():
         os.environ.setdefault(name, value)
     message = f"error: memory ran out in a library: {REMEDY}\n".encode()

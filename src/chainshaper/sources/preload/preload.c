@@ -42,6 +42,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/mman.h>
+#include <sys/prctl.h>
 #include <sys/socket.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
@@ -202,7 +203,10 @@ static void send_memory(const char *name) {
       char room[CMSG_SPACE(sizeof(int))];
     } control = {.header = {CMSG_LEN(sizeof(int)), SOL_SOCKET, SCM_RIGHTS}};
     memcpy(CMSG_DATA(&control.header), &descriptor, sizeof(int));
-    struct iovec content = {.iov_base = NAME, .iov_len = sizeof NAME};
+    // Its program may have ended before the recorder looks at it, and is named all the same.
+    char program[16] = "";
+    prctl(PR_GET_NAME, program);
+    struct iovec content = {.iov_base = program, .iov_len = sizeof program};
     struct msghdr message = {.msg_iov = &content, .msg_iovlen = 1, .msg_control = &control,
                              .msg_controllen = sizeof control.room};
     sendmsg(peer, &message, MSG_NOSIGNAL);

@@ -12,8 +12,9 @@ from chainshaper.sources.preload.memory import RefusedMemoryError, TracedProcess
 from chainshaper.values.errors import InputError, text_of
 
 NO_PROCESS = (
-    "no process of these users runs with the library in front: set what `chainshaper watch "
-    "--environment` prints before the application is started, or name its user (--user)"
+    "nothing is being traced: no process of these users runs with the library in front. Start "
+    "the robot with `chainshaper watch -- ros2 launch …`, or set what `chainshaper watch "
+    "--environment` prints before it is started, or name its user (--user)"
 )
 _MEMORY = re.compile(rb"/memfd:chainshaper-trace\b")
 
@@ -52,12 +53,16 @@ def name_of(pid: int) -> str:
     return text_of(read_proc(f"/proc/{pid}/comm").removesuffix(b"\n"))
 
 
-def left_out(pid: int, why: Exception) -> str:
-    """Return a sentence that names a process of which nothing is recorded."""
-    name = ""
+def left_out(pid: int, why: Exception, sent_name: str = "") -> str:
+    """Return a sentence that names a process of which nothing is recorded.
+
+    ``sent_name`` is what the process said that its program is called, for one that has ended.
+    """
+    name = sent_name
     with suppress(OSError):  # it has ended
-        name = f" ({name_of(pid)})"
-    return f"nothing of process {pid}{name} is recorded: {why}."
+        name = name_of(pid)
+    called = f" ({name})" if name else ""
+    return f"nothing of process {pid}{called} is recorded: {why}."
 
 
 def _memory_of(descriptor: Path, pid: int) -> TracedProcess | RefusedMemoryError | None:

@@ -21,7 +21,7 @@ from chainshaper.sources.preload.memory import RECORD, TracedProcess
 from chainshaper.sources.preload.running import NO_PROCESS, left_out, memories, name_of
 from chainshaper.sources.preload.tables import creation_tables, event_tables, joined_tables
 from chainshaper.sources.system import info_of, own_pid_namespace
-from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.errors import InputError, OperationError, text_of
 from chainshaper.values.events import EventTables
 from chainshaper.values.files import open_output
 from chainshaper.values.recording import RecordingInfo
@@ -180,17 +180,19 @@ class PreloadTracer:
             return
         peer.settimeout(_BETWEEN_LOOKS_S)
         try:
-            _, descriptors, _, _ = socket.recv_fds(peer, 64, 1)
+            message, descriptors, _, _ = socket.recv_fds(peer, 64, 1)
         except OSError:
             return
+        sent_name = text_of(message.partition(b"\0")[0])
         for descriptor in descriptors:
             try:
                 process = TracedProcess(descriptor, pid)
             except (InputError, OSError) as error:
-                self._refused.append(left_out(pid, error))
+                self._refused.append(left_out(pid, error, sent_name))
             else:
                 self._processes.append(process)
-                with suppress(OSError):
+                self._names[process.pid] = sent_name
+                with suppress(OSError):  # it has ended
                     self._names[process.pid] = name_of(pid)
             os.close(descriptor)
 
