@@ -16,6 +16,7 @@ constexpr std::size_t read_ahead = 1024;
 struct Header {
   Reached behind;
   const EventLayout * event;  // nullptr where `behind` is a failure
+  std::int64_t end{0};        // bits: behind the event; 0: not known yet
 };
 
 // Reads the headers of packets and events.
@@ -52,7 +53,7 @@ public:
         const auto last = low_bits(~std::uint64_t{0}, quick.id_bits);
         if ((word & last) != last) {
           run_.set_clock(low_bits(word >> quick.clock_shift, quick.clock_bits), quick.clock_bits);
-          return named(static_cast<std::int64_t>(word & last), behind);
+          return named(word & last, at, behind);
         }
       }
     }
@@ -62,16 +63,29 @@ public:
     return named(run_.variable(event_id), behind.bits());
   }
 
+  // Returns the position behind an event of constant layout.
+  Reached end_of(const Header & header) const {
+    const EventLayout & event = *header.event;
+    const auto end =
+        header.end != 0 ? header.end : align_up(header.behind.bits(), event.align) + event.size;
+    return end <= content_.end ? Reached(end) : Reached(Failure::truncated);
+  }
+
   // Returns the position behind an event's contexts and payload, without writing anything.
-  Reached step_over(const EventLayout & event, std::int64_t position) const {
-    if (event.align != 0) {
-      const auto behind = align_up(position, event.align) + event.size;
-      return behind <= content_.end ? Reached(behind) : Reached(Failure::truncated);
-    }
-    return run_.steps(event.steps, content_, position);
+  Reached step_over(const Header & header) const {
+    if (header.end != 0 || header.event->align != 0) return end_of(header);
+    return run_.steps(header.event->steps, content_, header.behind.bits());
   }
 
 private:
+  // The event whose quick header is from `at` to `behind`.
+  Header named(std::uint64_t id, std::int64_t at, std::int64_t behind) const {
+    if (id >= stream_.quick_events.size()) return named(static_cast<std::int64_t>(id), behind);
+    const auto [event, span] = stream_.quick_events[static_cast<std::size_t>(id)];
+    if (event == none) return {Failure::unknown_event, nullptr};
+    return {behind, &layout_.events[static_cast<std::size_t>(event)], span == 0 ? 0 : at + span};
+  }
+
   Header named(std::int64_t id, std::int64_t behind) const {
     const auto event = stream_.event(id);
     if (event == none) return {Failure::unknown_event, nullptr};
@@ -159,9 +173,11 @@ public:
         ends_(std::move(ends)),
         batches_(layout.events.size()) {}
 
-  // Writes an event that is wanted, whose contexts and payload begin at `position`.
-  Reached write(const EventLayout & event, const PacketEvents & packet, const Headers & headers,
-                Run & run, std::int64_t position) {
+  // Writes an event that is wanted; returns the position behind it.
+  Reached write(const Header & header, const PacketEvents & packet, const Headers & headers,
+                Run & run) {
+    const EventLayout & event = *header.event;
+    const auto position = header.behind.bits();
     const auto number = static_cast<std::size_t>(event.table);
     const TableColumns & table = tables_[number];
     if (rows_[number] >= ends_[number]) return Failure::table_full;
@@ -173,15 +189,15 @@ public:
       const Row place{table.columns.data(), row, &texts_};
       return run.steps(event.steps, content, position, &place);
     }
-    const auto begin = align_up(position, event.align);
-    if (begin + event.size > content.end) return Failure::truncated;
+    const auto end = headers.end_of(header);
+    if (end.failed()) return end;
     Batch & batch = batches_[static_cast<std::size_t>(&event - layout_.events.data())];
     if (!batch.is_followed_by(row)) {
       move(event, batch);
       batch.first_row = row;
     }
-    batch.places[batch.count++] = content.bytes.data() + (begin >> 3);
-    return begin + event.size;
+    batch.places[batch.count++] = content.bytes.data() + (align_up(position, event.align) >> 3);
+    return end;
   }
 
   // Writes what still waits; whether all rows were written that were expected.
@@ -304,7 +320,7 @@ void EventReader::count_packet(std::size_t number) {
           believed(headers, packet, run_, position, reached.bits(), event_of_id_0, header.event);
     if (reached.failed()) break;
     const EventLayout & event = *header.event;
-    reached = headers.step_over(event, reached.bits());
+    reached = headers.step_over(header);
     if (!run_.afford(event.cost)) reached = Failure::over_budget;
     if (!reached.failed() && reached.bits() == position) reached = Failure::truncated;
     if (reached.failed()) break;
@@ -341,10 +357,8 @@ std::vector<Text> EventReader::write(const Chunk & chunk, std::span<const TableC
     while (!reached.failed() && reached.bits() < packet.content_bits) {
       const auto header = headers.read(reached.bits());
       if (header.behind.failed()) file_changed();
-      const auto position = header.behind.bits();
-      reached = header.event->table != none
-                    ? writer.write(*header.event, packet, headers, run, position)
-                    : headers.step_over(*header.event, position);
+      reached = header.event->table != none ? writer.write(header, packet, headers, run)
+                                            : headers.step_over(header);
     }
     if (reached.failed() || (packet.content_bits > 0 && reached.bits() > packet.content_bits))
       file_changed();

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <array>
 #include <bit>
+#include <limits>
 #include <map>
 #include <stdexcept>
 #include <string>
@@ -545,6 +546,25 @@ void note_ids(StreamLayout & row, std::vector<std::pair<std::int64_t, std::int32
   }
 }
 
+// An event's span is known if its layout is constant, and its start is aligned wherever the
+// header's is.
+void note_spans(const Layout & layout, StreamLayout & row) {
+  if (row.quick.align == 0) return;
+  for (const auto number : row.events) {
+    QuickEvent quick{number, 0};
+    if (number != none) {
+      const EventLayout & event = layout.events[static_cast<std::size_t>(number)];
+      if (event.align != 0 && row.quick.align % event.align == 0) {
+        const auto behind = row.quick.clock_shift + row.quick.clock_bits;
+        const auto span = ((behind + event.align - 1) & -event.align) + event.size;
+        if (span <= std::numeric_limits<std::int32_t>::max())
+          quick.span = static_cast<std::int32_t>(span);
+      }
+    }
+    row.quick_events.push_back(quick);
+  }
+}
+
 void add_stream(Layout & layout, const TraceClass & trace, const StreamClass & stream,
                 Writer header, Steps in_header, std::span<const WantedEvent> & wanted) {
   StreamLayout row{};
@@ -576,6 +596,7 @@ void add_stream(Layout & layout, const TraceClass & trace, const StreamClass & s
     add_event(layout, header.following(false), stream, row.knows(cpu_id), header_cost, event, wish);
   }
   note_ids(row, std::move(ids));
+  note_spans(layout, row);
   layout.streams.push_back(std::move(row));
 }
 

@@ -116,6 +116,13 @@ struct QuickHeader {
   std::int64_t clock_bits{0};
 };
 
+// What follows a quick header with some id. Stepping from one event to the next waits for little
+// more than to load this.
+struct QuickEvent {
+  std::int32_t event{none};  // class
+  std::int32_t span{0};  // bits from the header's aligned start to the event's end; 0: not known
+};
+
 // Where the process and the thread of an event are, as 32 bits each: bits from where the event's
 // contexts begin.
 struct ProcessPlace {
@@ -136,7 +143,8 @@ struct StreamLayout {
   std::int64_t default_event{0};  // the id of all events, if they say none
   std::uint32_t known{0};         // bit n: packets have Variable n
   std::pair<std::int64_t, std::int64_t> uuid{0, 0};
-  std::vector<std::int32_t> events;  // event class by small id, or `none`
+  std::vector<std::int32_t> events;      // event class by small id, or `none`
+  std::vector<QuickEvent> quick_events;  // the same, of streams with a quick header
   std::vector<std::pair<std::int64_t, std::int32_t>> rare_events;  // large id and class, ascending
 
   bool knows(Variable variable) const { return (known >> variable & 1) != 0; }

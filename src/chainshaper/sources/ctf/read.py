@@ -6,9 +6,11 @@ are C++ (core/ctf), and run on several threads; of a large trace only some chunk
 once.
 """
 
+import mmap
 import os
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,11 @@ _CHUNK_BYTES = 32 << 20
 _SMALL_BYTES = 4 << 20
 _LARGE_BYTES = 512 << 20
 _HUGE_PAGE = 2 << 20
+_LARGE_COLUMN = 4 * _HUGE_PAGE
+_PAGE = 4096
+_APART = 320
+"""Columns side by side must not begin alike in their pages, or they would compete for the same few
+lines of the processor's cache: each begins so many bytes further than the one before it."""
 _MOST_WARNINGS = 20
 _FAILURES = {
     _core.CtfFailure.OTHER_TIME: "an event outside the time that its packet says it was open",
@@ -119,8 +126,9 @@ def read_events(
             for number, table in enumerate(wanted.tables)
         ]
         texts = _filled(pool, files, first_rows, columns, progress)
+        parts = _parts(pool, columns, texts)
     try:
-        events = Events(_frames(columns, texts))
+        events = Events(_frames(parts))
     except pl.exceptions.PolarsError as error:
         reason = f"events of one name have fields of types that do not fit together: {error}"
         folder = trace.folders[0].path
@@ -240,8 +248,9 @@ def _filled(
 class _Columns:
     """The arrays of one table of so many ``rows``: time, cpu (or nothing) and its columns' values.
 
-    They are parts of one piece of memory, large enough for huge pages: page faults would else be a
-    third of all work.
+    Large ones have memory of their own, so that a frame that is made of some of them keeps no
+    others. The small ones of a table are parts of one piece of memory, large enough for huge pages:
+    page faults would else be a third of all work.
     """
 
     def __init__(self, number: int, table: Table, rows: int) -> None:
@@ -249,14 +258,16 @@ class _Columns:
         wanted: list[tuple[int, np.dtype[Any]]] = [(rows, np.dtype("i8"))]
         wanted += [(rows * table.has_cpu, np.dtype("i4"))]
         wanted += [(rows, kind) for kind in table.column_types()]
-        # Columns side by side must not begin alike in their pages, or they would compete for
-        # the same few lines of the processor's cache.
-        sizes = [-(-count * kind.itemsize // 4096) * 4096 + 320 for count, kind in wanted]
-        parts = np.split(_memory(sum(sizes)), np.cumsum(sizes))
-        self.time, self.cpu, *self.values = (
-            part[: count * kind.itemsize].view(kind)
-            for part, (count, kind) in zip(parts, wanted, strict=False)
-        )
+        sizes = [-(-count * kind.itemsize // _PAGE) * _PAGE + _APART for count, kind in wanted]
+        shared = _memory(sum(size for size in sizes if size < _LARGE_COLUMN))
+        arrays = []
+        for place, (size, (count, kind)) in enumerate(zip(sizes, wanted, strict=True)):
+            if size < _LARGE_COLUMN:
+                memory, shared = shared[:size], shared[size:]
+            else:
+                memory = _returned_memory(place * _APART + size)[place * _APART :]
+            arrays.append(memory[: count * kind.itemsize].view(kind))
+        self.time, self.cpu, *self.values = arrays
 
     def arrays(self) -> _core.CtfTable:
         """The arrays for the decoder to write to."""
@@ -300,15 +311,33 @@ def _memory(size: int) -> NDArray[np.uint8]:
     return memory[first : first + size]
 
 
-def _frames(columns: list[_Columns], known: list[bytes]) -> dict[str, pl.DataFrame]:
+def _returned_memory(size: int) -> NDArray[np.uint8]:
+    """Zeros in huge pages, which the system gets back with the last array that has a part of them.
+
+    NumPy's memory is `malloc`'s, which keeps what it has once let go.
+    """
+    memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    with suppress(OSError):  # a kernel without huge pages
+        memory.madvise(mmap.MADV_HUGEPAGE)
+    return np.frombuffer(memory, np.uint8)
+
+
+def _parts(
+    pool: ThreadPoolExecutor, columns: list[_Columns], known: list[bytes]
+) -> dict[str, list[pl.DataFrame]]:
+    """Event → the frames of its tables; codes of texts are of what is ``known``."""
     texts = [text.decode(errors="backslashreplace") for text in known]
     strings = pl.Series("", texts or [""], dtype=pl.String)
     categories = strings.cast(pl.Categorical)
     parts: dict[str, list[pl.DataFrame]] = {}
-    while columns:
-        # Arrays are let go one table at a time: Polars has copies of its own.
-        table = columns.pop(0)
-        parts.setdefault(table.table.name, []).append(table.frame(known, strings, categories))
+    frames = pool.map(lambda table: table.frame(known, strings, categories), columns)
+    for table, frame in zip(columns, frames, strict=True):
+        parts.setdefault(table.table.name, []).append(frame)
+    return parts
+
+
+def _frames(parts: dict[str, list[pl.DataFrame]]) -> dict[str, pl.DataFrame]:
+    """One frame for each event, ordered by name."""
     frames: dict[str, pl.DataFrame] = {}
     for name in sorted(parts):
         frame = pl.concat(parts[name], how="diagonal_relaxed", rechunk=True)
