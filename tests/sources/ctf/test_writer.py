@@ -106,7 +106,7 @@ def test_many_spans_and_threads_give_the_same_frames(
     make_trace(tmp_path, streams=4, packets=10, events=60)
     trace = open_trace(tmp_path)
     whole = read_events(trace)
-    monkeypatch.setattr(decode, "_SMALL_BYTES", 0)
+    monkeypatch.setattr(decode, "_SMALLEST_CHUNK_BYTES", 0)
     monkeypatch.setattr(decode, "_CHUNK_BYTES", 4096)
     for threads in (1, 3):
         cut = read_events(trace, threads=threads)
