@@ -517,7 +517,7 @@ void join_table(Layout & layout, EventLayout & event, const WantedEvent & wanted
   if (wanted.table < 0 || number > layout.tables.size())
     throw std::invalid_argument("tables are counted in order of their first event");
   for (const auto width : table.widths) event.cost += width;
-  event.cost += 8 + 4 * static_cast<int>(table.has_cpu);
+  event.cost += 8 + (table.has_cpu ? 4 : 0);  // the time and the core
   event.table = wanted.table;
   if (number == layout.tables.size()) {
     layout.tables.push_back(std::move(table));

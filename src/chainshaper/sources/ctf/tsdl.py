@@ -353,9 +353,10 @@ class _Parser:
 
     def accept(self, text: str) -> bool:
         """Go over the word or mark ``text`` if it is the next token; whether it is."""
-        accepted = self.at(text)
-        self.position += accepted
-        return accepted
+        if not self.at(text):
+            return False
+        self.position += 1
+        return True
 
     def expect(self, text: str) -> None:
         """Go over the word or mark ``text``, which must be the next token."""

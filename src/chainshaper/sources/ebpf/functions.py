@@ -144,13 +144,15 @@ def type_argument(name: str | None, number: int) -> str | None:
     arguments, depth = [""], 0
     # `->` ends no template, so it is one other character for the time being.
     for character in name[name.index("<") :].replace("->", "→"):
-        depth -= character in ">)]}"
+        if character in ">)]}":
+            depth -= 1
         if depth == 0 and character == ">":
             break
         if character == "," and depth == 1:
             arguments.append("")
         elif depth:
             arguments[-1] += character
-        depth += character in "<([{"
+        if character in "<([{":
+            depth += 1
     arguments = [argument.strip().replace("→", "->") for argument in arguments]
     return arguments[number] if number < len(arguments) else None
