@@ -14,8 +14,8 @@ constexpr std::int64_t zeros_of_no_event = 32;
 constexpr std::size_t read_ahead = 1024;
 
 struct Header {
-  Reached behind;             // where it ends, or why it cannot be read
-  const EventLayout * event;  // nullptr: it cannot be read
+  Reached behind;
+  const EventLayout * event;  // nullptr where `behind` is a failure
 };
 
 // Reads the headers of packets and events.
@@ -63,7 +63,7 @@ public:
     return named(run_.variable(event_id), behind.bits());
   }
 
-  // Returns where an event's contexts and payload end; writes nothing.
+  // Returns the position behind an event's contexts and payload, without writing anything.
   Reached step_over(const EventLayout & event, std::int64_t position) const {
     if (event.align != 0) {
       const auto behind = align_up(position, event.align) + event.size;

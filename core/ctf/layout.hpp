@@ -117,8 +117,8 @@ struct QuickHeader {
   std::int64_t clock_bits{0};
 };
 
-// Where the numbers of an event's process and thread are, of 32 bits each: in bits from the
-// beginning of the event's contexts.
+// Where the process and the thread of an event are, as 32 bits each: bits from where the event's
+// contexts begin.
 struct ProcessPlace {
   std::int64_t align{0};  // 0: not known; or a kernel's trace, in which 0 is a valid number
   std::int64_t process{0};

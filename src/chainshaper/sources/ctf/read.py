@@ -1,7 +1,7 @@
 """Count events, and read them into data frames.
 
 Pass 1 (`_File.count`) steps over every event of a file and counts, so that the row of each event is
-known. Pass 2 (`_fill`) writes the wanted events, chunk by chunk of the files, to their rows; then
+known. Pass 2 (`_filled`) writes the wanted events, chunk by chunk of the files, to their rows; then
 each table is sorted by time. Both passes are C++ (core/ctf), and run on several threads. Of a large
 trace only some chunks are in memory at once.
 """
@@ -118,7 +118,7 @@ def read_events(
             _Columns(number, table, int(first_rows[-1][number]) if files else 0)
             for number, table in enumerate(wanted.tables)
         ]
-        texts = _fill(pool, files, first_rows, columns, progress)
+        texts = _filled(pool, files, first_rows, columns, progress)
     try:
         events = Events(_frames(columns, texts))
     except pl.exceptions.PolarsError as error:
@@ -208,7 +208,7 @@ def _warnings(files: Sequence[_File]) -> Iterator[str]:
 # Pass 2
 
 
-def _fill(
+def _filled(
     pool: ThreadPoolExecutor,
     files: list[_File],
     first_rows: NDArray[np.int64],
@@ -247,10 +247,10 @@ def _fill(
 
 
 class _Columns:
-    """The arrays of a table with so many ``rows``: its times, its cores if known, and its columns.
+    """The arrays of one table of so many ``rows``: time, cpu (or nothing) and its columns' values.
 
-    They are parts of one piece of memory, which is large enough for huge pages: page faults would
-    else be a third of all work.
+    They are parts of one piece of memory, large enough for huge pages: page faults would else be a
+    third of all work.
     """
 
     def __init__(self, number: int, table: Table, rows: int) -> None:
@@ -312,16 +312,15 @@ def _memory(size: int) -> NDArray[np.uint8]:
     return memory[first : first + size]
 
 
-def _frames(columns: list[_Columns], texts: list[bytes]) -> dict[str, pl.DataFrame]:
-    """Make one frame for each name of event; empties ``columns``."""
-    decoded = [text.decode(errors="backslashreplace") for text in texts]
-    strings = pl.Series("", decoded or [""], dtype=pl.String)
+def _frames(columns: list[_Columns], known: list[bytes]) -> dict[str, pl.DataFrame]:
+    texts = [text.decode(errors="backslashreplace") for text in known]
+    strings = pl.Series("", texts or [""], dtype=pl.String)
     categories = strings.cast(pl.Categorical)
     parts: dict[str, list[pl.DataFrame]] = {}
     while columns:
-        # Each table's arrays are let go as soon as Polars has copied them.
+        # Arrays are let go one table at a time: Polars has copies of its own.
         table = columns.pop(0)
-        parts.setdefault(table.table.name, []).append(table.frame(texts, strings, categories))
+        parts.setdefault(table.table.name, []).append(table.frame(known, strings, categories))
     frames: dict[str, pl.DataFrame] = {}
     for name in sorted(parts):
         frame = pl.concat(parts[name], how="diagonal_relaxed", rechunk=True)
