@@ -21,7 +21,7 @@ from typing import Any
 
 import polars as pl
 
-from chainshaper.linux.own_processes import is_installed, tool_environment
+from chainshaper.linux.child_processes import is_installed, tool_environment
 from chainshaper.linux.processes import descendants, run_users, user_name, user_of
 from chainshaper.linux.scheduling import signalled_with_parent
 from chainshaper.linux.threads import parents, read_proc, read_stat, status_field

@@ -32,7 +32,7 @@ from xml.etree import ElementTree
 
 import polars as pl
 
-from chainshaper.linux.own_processes import is_installed, tool_environment
+from chainshaper.linux.child_processes import is_installed, tool_environment
 from chainshaper.linux.processes import descendants, process_folder, run_users, user_in
 from chainshaper.linux.scheduling import signalled_with_parent
 from chainshaper.linux.threads import parents, read_proc
