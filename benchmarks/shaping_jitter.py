@@ -20,7 +20,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from chainshaper.flow.described import run_demo
+from chainshaper.flow.demonstration import run_demo
 from chainshaper.values.durations import milliseconds
 from chainshaper.verify.measure import Measurement
 
@@ -69,7 +69,11 @@ def main() -> None:
         for run in range(1, options.runs + 1):
             with compile_beside(Path(name)) as load:
                 print(f"run {run}: {options.cycles} cycles each, beside: {load}", flush=True)
-                before, after = run_demo(folder / f"run{run}", cycles=options.cycles).measurements
+                shown = run_demo(folder / f"run{run}", cycles=options.cycles)
+            if shown.comparison is None:
+                print(f"  nothing could be planned: {shown.unplanned}")
+                continue
+            before, after = shown.comparison.measurements
             for note in dict.fromkeys(before.recording.info.notes + after.recording.info.notes):
                 print(f"  note: {note}")
             results.append((f"run {run}", before, after))

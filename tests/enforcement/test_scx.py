@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import platform
 import shutil
 import signal
 import struct
@@ -106,8 +107,17 @@ def test_what_else_a_machine_lacks_is_named_with_the_remedy(
     monkeypatch.setattr(scx, "KERNEL_TYPES", machine / "none")
     assert "CONFIG_DEBUG_INFO_BTF" in (scx.missing() or "")
     monkeypatch.setattr(scx, "SCHED_EXT", machine / "none")
-    with pytest.raises(PlatformError, match=r"scx: this kernel has no sched_ext.*SCHED_CLASS_EXT"):
-        scx.create(TABLE)
+    for release, reason in (
+        (
+            "6.18.44-cloud",
+            r"scx: this kernel \(6.18.44-cloud\) was built without CONFIG_SCHED_CLASS_E",
+        ),
+        ("6.8.0-45-generic", r"\(6.8.0-45-generic\) has no sched_ext: use Linux 6.12 or newer"),
+        ("6.1", r"has no sched_ext: use Linux 6.12"),
+    ):
+        monkeypatch.setattr(platform, "release", lambda release=release: release)
+        with pytest.raises(PlatformError, match=reason):
+            scx.create(TABLE)
 
 
 def test_an_absent_or_old_libbpf_is_named_with_its_package(monkeypatch: pytest.MonkeyPatch) -> None:

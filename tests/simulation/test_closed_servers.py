@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from schedules import MS
 
-from chainshaper.flow.described import synthetic_chain
+from chainshaper.flow.demonstration import synthetic_chain
 from chainshaper.planning import CallbackTimes, ChainPlan, Plan, plan_shaping
 from chainshaper.planning.chain_plan import revised
 from chainshaper.planning.shaping import server_per_callback

@@ -436,6 +436,15 @@ def test_a_path_needs_no_package(robot: Path, monkeypatch: pytest.MonkeyPatch) -
     assert command.with_file(Path("/c.xml")) == ["ros2", "launch", "/c.xml", "speed:=3"]
 
 
+def test_without_ros_2_it_is_not_the_package_that_is_missing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("AMENT_PREFIX_PATH", "")
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    with pytest.raises(InputError, match=r"robot: ROS 2 is not sourced \(no `ros2` on the path\)"):
+        parse_launch_command(["ros2", "launch", "robot", "all.launch.py"])
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

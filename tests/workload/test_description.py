@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_chain import small_chain_text
 
-from chainshaper.flow.described import synthetic_chain
+from chainshaper.flow.demonstration import synthetic_chain
 from chainshaper.values.errors import InputError
 from chainshaper.workload.description import (
     Application,

@@ -261,6 +261,7 @@ def analyse_latency(
     *,
     due: Sequence[Due] = (),
     between: tuple[int, int | None] | None = None,
+    pauses: Sequence[tuple[int, int]] = (),
 ) -> LatencyAnalysis:
     """Measure every traversal of ``chain`` in a recording, with statistics.
 
@@ -269,6 +270,8 @@ def analyse_latency(
     * ``due``: when a plan has outputs leave. What is due of other chains is ignored.
     * ``between``: two instants (ns; the second may be None). Traversals that did not both begin and
       end between them are left out.
+    * ``pauses``: times in which nothing ran, each from an instant until another (ns). Nothing was
+      due then.
 
     Raises InputError: the chain is not in the recording, see :func:`~.chains.find_chain`.
     """
@@ -327,7 +330,7 @@ def analyse_latency(
         incomplete=dict(reasons.iter_rows()),
         silent=traversals.silent,
         notes=(*notes, *flow.notes, *traversals.notes),
-        not_begun=0 if own_due is None else not_begun(flow, chain, own_due, between),
+        not_begun=0 if own_due is None else not_begun(flow, chain, own_due, between, pauses),
         period_ns=timer_period(flow, chain),
     )
 

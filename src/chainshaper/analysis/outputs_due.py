@@ -14,6 +14,8 @@ by whole cycles and stay behind. When an application ends, its nodes end one by 
 tenth of a recording, 3 s at most, no beginning is missed.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 import polars as pl
@@ -54,12 +56,14 @@ def with_outputs_due(
     return frame.with_columns(was_due=(due & ~as_planned).fill_null(False))
 
 
-def _running_until(flow: DataFlow, until_ns: int | None) -> int:
-    """The instant until which every node ran, unless it ended by itself (ns)."""
-    if until_ns is not None:
-        return until_ns
+def _running_until(flow: DataFlow, since_ns: int, until_ns: int | None) -> int:
+    """The instant until which every node ran, unless it ended by itself (ns), of a run that ended
+    with its recording.
+    """
     times = flow.instances["start"]
-    first, last = int(times.min() or 0), int(times.max() or 0)  # type: ignore[arg-type]
+    times = times.filter(times >= since_ns)
+    times = times if until_ns is None else times.filter(times <= until_ns)
+    first, last = int(times.min() or 0), int(times.max() or 0)
     return last - min(ENDING_NS, (last - first) // ENDING_PART)
 
 
@@ -68,23 +72,38 @@ def not_begun(
     chain: Chain,
     due: Due,
     between: tuple[int, int | None] | None,
+    pauses: Sequence[tuple[int, int]] = (),
 ) -> int:
     """Count the cycles of a plan, after the first, in which a chain did not begin.
 
-    Cycles in which its first callback ran and published nothing do not count. A chain that a
+    Cycles in which its first callback ran and published nothing do not count, nor do those in
+    ``pauses``, each from an instant until another (ns), in which nothing ran. A chain that a
     message begins owes nothing without one: the number is 0.
     """
     if timer_period(flow, chain) is None:
         return 0
     starts = flow.instances.filter(pl.col("callback_id") == chain.callbacks[0])["start"].sort()
     since_ns, until_ns = between or (0, None)
+    total, from_ns = 0, since_ns
+    for paused_ns, resumed_ns in pauses:  # each run by itself
+        running_until = _running_until(flow, from_ns, paused_ns)
+        total += _not_begun_between(starts, due, from_ns, paused_ns + 1, running_until)
+        from_ns = resumed_ns
+    running_until = _running_until(flow, from_ns, None) if until_ns is None else until_ns
+    return total + _not_begun_between(starts, due, from_ns, until_ns, running_until)
+
+
+def _not_begun_between(
+    starts: pl.Series, due: Due, since_ns: int, until_ns: int | None, running_until_ns: int
+) -> int:
+    """Count the cycles that did not begin, from one instant until another."""
     starts = starts.filter(starts >= since_ns)
     starts = starts if until_ns is None else starts.filter(starts < until_ns)
     if not len(starts):
         return 0
     behind = starts.to_numpy() - np.arange(len(starts)) * due.cycle_ns
     skipped = int(_stays_behind(behind, due.cycle_ns).sum())
-    quiet = _running_until(flow, until_ns) - int(starts[-1]) - due.cycles * due.cycle_ns
+    quiet = running_until_ns - int(starts[-1]) - due.cycles * due.cycle_ns
     return skipped + max(0, round(quiet / due.cycle_ns - 1))
 
 

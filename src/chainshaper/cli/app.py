@@ -19,18 +19,25 @@ __all__ = ["USAGE_ERROR", "VERBS", "Abort", "app"]
 USAGE_ERROR: Any = typer.BadParameter.__base__
 """What Typer raises where a command line is wrong; the name of its module changes."""
 
-_MODULES = (
-    ("runs", "demo init run simulate generate"),
-    ("plans", "sweep"),
-    ("runs", "record profile watch"),
-    ("traces", "info describe graph callbacks chains latency convert"),
-    ("plans", "plan offsets splice"),
-    ("runs", "shape"),
-    ("traces", "compare budget check report export"),
-    ("applying", "threads apply status release doctor"),
-)
-VERBS = {verb: module for module, verbs in _MODULES for verb in verbs.split()}
-"""The module of each verb, which is a function there; in the order in which `--help` lists them."""
+GROUPS = {
+    "Start": "demo init doctor",
+    "Record": "record profile run simulate generate describe convert",
+    "Look": "info graph chains callbacks latency report export threads watch",
+    "Plan": "plan offsets sweep",
+    "Shape": "shape splice apply status release",
+    "Judge": "compare budget check",
+}
+"""The verbs in the order in which `--help` lists them, by what a user wants to do."""
+
+_MODULES = {
+    "runs": "demo init run simulate generate record profile watch shape",
+    "plans": "plan offsets sweep splice",
+    "traces": "info describe graph callbacks chains latency convert compare budget check report"
+    " export",
+    "applying": "threads apply status release doctor",
+}
+VERBS = {verb: module for module, verbs in _MODULES.items() for verb in verbs.split()}
+"""The module of each verb, which is a function there."""
 
 _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
@@ -46,6 +53,14 @@ class _PlainGroup(TyperGroup):
 
     def get_help(self, ctx: Any) -> str:
         return _as_shown(super().get_help(ctx))
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002 - Click calls it so
+        for title, verbs in GROUPS.items():
+            commands = [(verb, self.commands[verb]) for verb in verbs.split()]
+            with formatter.section(title):
+                formatter.write_dl(
+                    [(verb, command.get_short_help_str()) for verb, command in commands]
+                )
 
 
 class _PlainCommand(TyperCommand):

@@ -283,8 +283,8 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
     topic, colon, listed = text.partition(":")
     if not colon:
         raise InputError(
-            f"--modes {text}: write the topic that announces the modes, and each mode once, such as"
-            " /driving_mode:city,highway"
+            f"--modes {text}: which topic announces the modes? Write it in front of them, such as"
+            f" /driving_mode:{text}"
         )
     pairs = [pair.partition("=") for pair in listed.split(",")]
     bands = {mode: int(band) for mode, _, band in pairs if band.isdecimal()}

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from chainshaper.analysis import ChainEnumeration
+    from chainshaper.flow.demonstration import Demonstration
     from chainshaper.monitor.budgets import Budget, Judged
     from chainshaper.monitor.watch import Seen, Watch
     from chainshaper.values.application import ApplicationGraph
@@ -58,40 +59,64 @@ def demo(
     realtime: bool | None = opt.REALTIME,
     *,
     request: "cs.PlanRequest",
+    verbose: bool = opt.option("--verbose", "Print all tables, too, and every note.", False),
     json: bool = opt.JSON,
 ) -> None:
     """Measure a live chain, plan, splice the shaping node, measure again, show the gain.
 
-    Runs the paper's synthetic chain as real processes over real DDS topics, for about a minute and
-    a half. Needs no ROS 2.
+    Runs the paper's synthetic chain as real processes over real DDS topics, for about two minutes.
+    Needs no ROS 2. Runs without and with the plan take turns, so that both meet the same machine.
     """
-    from chainshaper.flow.described import run_demo
+    from chainshaper.flow.demonstration import run_demo
     from chainshaper.reporting.latency import comparison_json
-    from chainshaper.reporting.overviews import callback_table, plan_table
 
     folder = output or Path(f"chainshaper-demo-{datetime.now():%Y%m%d-%H%M%S}")
     with out.progress("demo") as report:
-        compared = run_demo(
+        shown = run_demo(
             folder,
             application=application,
             cycles=cycles,
             request=request,
             realtime=realtime,
             command=sys.argv,
-            planned=out.warn,
             progress=report,
         )
-    before, after = (measurement.recording for measurement in compared.measurements)
-    flow = cs.data_flow(before.events, before.info.clock_offset_ns)
-    tables = [callback_table(cs.callback_statistics(flow))]
-    tables += [
-        plan_table(cs.load_plan(folder / "plan.yaml").chains[0]),
-        comparison_tables(compared)[0],
-    ]
-    if out.present(json, comparison_json(compared) | {"folder": str(folder)}, *tables):
-        out.notes(dict.fromkeys((*before.info.notes, *after.info.notes)))
-        out.show_line(folder.absolute())
-        judge([compared], strict=False, json=json)
+    if shown.comparison is None:
+        values: dict[str, Any] = {"folder": str(folder), "unplanned": shown.unplanned}
+    else:
+        values = comparison_json(shown.comparison) | {"folder": str(folder)}
+    if json:
+        out.print_json(values | {"longer": shown.longer})
+        return
+    _show_demonstration(shown, verbose=verbose)
+
+
+def _show_demonstration(shown: "Demonstration", *, verbose: bool) -> None:
+    """Show what a demonstration has shown on one screen; ``verbose`` shows all tables."""
+    from chainshaper.reporting.overviews import callback_table, plan_table
+    from chainshaper.reporting.screen import comparison_lines, unplanned_lines
+
+    before, folder = shown.before.recording, shown.folder
+    if verbose:
+        flow = cs.data_flow(before.events, before.info.clock_offset_ns)
+        out.show(callback_table(cs.callback_statistics(flow)))
+        if shown.comparison is not None:
+            plan = cs.load_plan(folder / "plan.yaml")
+            out.show(*map(plan_table, plan.chains), *comparison_tables(shown.comparison))
+            out.warn(plan)
+        out.notes(before.info.notes)
+    if shown.comparison is None:
+        out.show(*unplanned_lines(shown.before, shown.unplanned or ""))
+    else:
+        out.show(*comparison_lines(shown.comparison))
+    if shown.longer:
+        out.show_line("  ! Stalls hit more than a third of the cycles: it measured for longer.")
+    out.show_line("")
+    look = "report.html" if shown.comparison is not None else "before"
+    out.show_line(f"  Look        {folder / look}")
+    out.show_line(
+        "  Your robot  chainshaper shape -o shaped -- ros2 launch my_robot robot.launch.py"
+    )
 
 
 def init(
@@ -103,7 +128,7 @@ def init(
 
     Edit its nodes, callbacks and execution times; `chainshaper run` and `simulate` take it.
     """
-    from chainshaper.flow.described import synthetic_chain
+    from chainshaper.flow.demonstration import synthetic_chain
     from chainshaper.values.files import new_file, write_whole
 
     write_whole(new_file(output, opt.DESCRIPTIONS), [synthetic_chain().read_bytes()])
@@ -586,6 +611,7 @@ def shape(
     mode_profile: list[str] | None = opt.MODE_PROFILE,
     user: list[str] | None = opt.USERS,
     strict: bool = opt.STRICT,
+    verbose: bool = opt.option("--verbose", "Print all tables, too, and every note.", False),
     json: bool = opt.JSON,
 ) -> None:
     """Run an application with its output shaped as planned, and record it.
@@ -641,7 +667,7 @@ def shape(
             planned=out.warn,
             progress=out.stage_lines("shape"),
         )
-    _show_shaped_launch(shaped, strict=strict, json=json)
+    _show_shaped_launch(shaped, strict=strict, verbose=verbose, json=json)
 
 
 def _show_shaped_recording(recording: "cs.Recording", *, strict: bool) -> None:
@@ -661,20 +687,34 @@ def _show_shaped_recording(recording: "cs.Recording", *, strict: bool) -> None:
     judge(comparisons, strict=strict, json=False)
 
 
-def _show_shaped_launch(shaped: "cs.ShapedLaunch", *, strict: bool, json: bool) -> None:
+def _show_shaped_launch(
+    shaped: "cs.ShapedLaunch", *, strict: bool, verbose: bool, json: bool
+) -> None:
     """Show the comparison of a launched application's chains, and judge it."""
     from chainshaper.reporting.latency import comparison_json
+    from chainshaper.reporting.screen import comparison_lines
 
     values = comparison_json(shaped.comparison) | {
         "folder": str(shaped.folder),
         "chains": [comparison_json(comparison) for comparison in shaped.comparisons],
         "cores": dict(shaped.cores),
     }
-    tables = [table for comparison in shaped.comparisons for table in comparison_tables(comparison)]
-    if out.present(json, values, *tables):
-        out.notes(shaped.notes)
-        out.show_line(shaped.folder)
-    judge(shaped.comparisons, strict=strict, json=json)
+    if json:
+        out.print_json(values)
+    else:
+        if verbose:
+            out.show(*comparison_tables(*shaped.comparisons))
+            out.notes(shaped.notes)
+        for number, comparison in enumerate(shaped.comparisons, start=1):
+            results = shaped.folder if number == 1 else shaped.folder / f"chain_{number}"
+            out.show_line(f"  {comparison.chain}")
+            out.show(*comparison_lines(comparison))
+            out.show_line(f"\n  Look        {results / 'report.html'}")
+        if shaped.splicing is not None:
+            launch = next(iter(shaped.splicing.launch.values()))
+            plan = shaped.folder / "plan.yaml"
+            out.show_line(f"  Keep it so  chainshaper apply {plan} -- ros2 launch {launch}")
+    judge(shaped.comparisons, strict=strict, json=True)
 
 
 def _ask(graph: "ApplicationGraph", listed: "ChainEnumeration") -> str:

@@ -46,6 +46,12 @@ def threads_for(planned: Thread, allocation: Allocation) -> list[NodeThread]:
         raise OperationError(ambiguous_node(planned.node, pids))
     if not pids:
         running = sorted({node for listed in allocation.threads for node in listed.nodes})
+        if not running:
+            raise OperationError(
+                f"no node of the plan runs, nor any other: start the robot first, or let it be"
+                f" started: `chainshaper apply plan.yaml -- COMMAND` (waited for: {planned.node})"
+                + (f"; {allocation.strangers}" if allocation.strangers else "")
+            )
         raise OperationError(
             f"node {planned.node} of the plan is not running, or cannot be recognised; running: "
             f"{', '.join(running) or 'no node'}; start it with `--ros-args -r __node:=NAME`, or"

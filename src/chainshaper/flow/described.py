@@ -1,39 +1,32 @@
-"""A described application, live: shaped by a plan; and the demonstration, the whole flow."""
+"""A described application, live, shaped by a plan."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from importlib import resources
 from pathlib import Path
 
 from chainshaper.enforcement.back_ends import choose_back_end, make_back_end
 from chainshaper.enforcement.guardian import run_claimed
 from chainshaper.flow.drift import SlotFollower
 from chainshaper.flow.followed_chains import followed_chains
-from chainshaper.flow.plan import plan_recording
 from chainshaper.flow.server_tables import table_of
-from chainshaper.planning import ChainPlan, PlanRequest, save_plan
+from chainshaper.planning import ChainPlan
 from chainshaper.planning.chain_plan import Server, Thread
 from chainshaper.planning.plan import Plan, open_until_done
 from chainshaper.planning.plan_file import plan_values
-from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.application import splice_application
 from chainshaper.splicing.shaped_outputs import remove_abandoned_pages
 from chainshaper.values.errors import OperationError
-from chainshaper.values.files import write_whole
 from chainshaper.values.progress import Progress
-from chainshaper.values.recording import Recording, refuse_existing
-from chainshaper.verify.measure import Comparison, compare_recordings
-from chainshaper.workload.description import Application, load_application
+from chainshaper.values.recording import Recording
+from chainshaper.workload.description import Application
 from chainshaper.workload.live import (
     Enforcement,
     StartedNodes,
     node_threads,
     run_application,
 )
-
-_STANDARD = PlanRequest()
 
 
 def shape_application(
@@ -184,74 +177,3 @@ def _threads_of(planned: Thread, nodes: StartedNodes) -> list[int]:
             "(`publication: asynchronous` under `topics`), or plan with --publication synchronous"
         )
     return tids
-
-
-def synthetic_chain() -> Path:
-    """Return the description of the paper's synthetic chain (section 2.5)."""
-    return Path(str(resources.files("chainshaper") / "examples" / "synthetic_chain.yaml"))
-
-
-def run_demo(
-    folder: str | Path,
-    *,
-    application: str | Path | None = None,
-    cycles: int = 320,
-    request: PlanRequest = _STANDARD,
-    realtime: bool | None = None,
-    command: Sequence[str] = (),
-    planned: Callable[[Plan], None] = lambda _: None,
-    progress: Progress = lambda *_: None,
-) -> Comparison:
-    """Run an application, plan, shape, run again and compare.
-
-    The recordings `before` and `after` are in ``folder``, beside `application.yaml`, `plan.yaml`,
-    and the comparison's figures.
-
-    Raises InputError: ``folder`` exists and is not empty, or the application is not right.
-    PlatformError, OperationError: a step failed; complete recordings stay, without one nothing.
-    """
-    folder = refuse_existing(folder)
-    path = synthetic_chain() if application is None else Path(application)
-    description = load_application(path)
-
-    def part(start: float, title: str) -> Progress:
-        return lambda done, doing: progress(start + 0.48 * done, f"{title}, {doing}")
-
-    is_new, copy = not folder.exists(), folder / "application.yaml"
-    report = part(0.0, "unshaped run")
-    try:
-        folder.mkdir(exist_ok=True)
-        write_whole(copy, [path.read_bytes()])
-        before = run_application(
-            description,
-            folder / "before",
-            cycles=cycles,
-            realtime=realtime,
-            command=command,
-            progress=report,
-        )
-    except OSError as error:
-        raise OperationError(f"{folder}: cannot be written: {error}") from error
-    finally:
-        if not (folder / "before").exists():  # nothing came to stand beside it
-            copy.unlink(missing_ok=True)
-            if is_new and folder.exists():
-                folder.rmdir()
-    progress(0.48, "planning")
-    plan = plan_recording(before, request=request)
-    save_plan(plan, folder / "plan.yaml")
-    planned(plan)
-    report = part(0.5, "shaped run")
-    after = shape_application(
-        description,
-        plan,
-        folder / "after",
-        cycles=cycles,
-        realtime=realtime,
-        command=command,
-        progress=report,
-    )
-    progress(0.98, "comparing")
-    comparison = compare_recordings([before, after])
-    write_comparison(comparison, folder)
-    return comparison

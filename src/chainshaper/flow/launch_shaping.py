@@ -36,6 +36,7 @@ from chainshaper.planning import ChainPlan, Plan, PlanRequest, Profile
 from chainshaper.planning import request as requests
 from chainshaper.planning.profile import doubts_about
 from chainshaper.reporting.figures import write_comparison
+from chainshaper.reporting.page import write_report
 from chainshaper.splicing.node_kinds import language_of
 from chainshaper.splicing.node_packages import build_package, check_build_tools
 from chainshaper.splicing.shaped_outputs import remove_abandoned_pages
@@ -449,7 +450,9 @@ def _compared(
         for chain, recording in zip(wanted, before, strict=True)
     )
     for place, comparison in enumerate(comparisons):
-        write_comparison(comparison, folder / f"chain_{place + 1}" if place else folder)
+        results = folder / f"chain_{place + 1}" if place else folder
+        write_comparison(comparison, results)
+        write_report([comparison], results / "report.html")
     return comparisons
 
 

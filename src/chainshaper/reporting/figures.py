@@ -4,7 +4,6 @@ The colours differ for colour-blind readers and in grey print as well.
 """
 
 import io
-import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import cycle
@@ -16,7 +15,7 @@ import polars as pl
 
 from chainshaper.planning import BandChoice
 from chainshaper.planning.overruns import slots_of_latency
-from chainshaper.reporting.latency import comparison_json
+from chainshaper.reporting.latency import write_comparison_json
 from chainshaper.reporting.overviews import sweep_axes, sweep_value
 from chainshaper.values.errors import InputError, OperationError, shown
 from chainshaper.values.files import new_file, why_distrusted, write_whole
@@ -34,8 +33,7 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
     Raises OperationError: they cannot be written.
     """
     draw_comparison(comparison.measurements, folder)
-    text = json.dumps(comparison_json(comparison), indent=2) + "\n"
-    write_whole(folder / "comparison.json", [text.encode()])
+    write_comparison_json(comparison, folder)
 
 
 def draw_comparison(measurements: Sequence[Measurement], folder: str | Path) -> tuple[Path, Path]:

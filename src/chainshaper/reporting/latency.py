@@ -4,8 +4,10 @@ They show its figures, several recordings beside each other, a prediction beside
 where the time goes, and cycles that have no latency.
 """
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import polars as pl
@@ -28,6 +30,7 @@ from chainshaper.reporting.tables import (
     words,
 )
 from chainshaper.values.durations import duration_text, milliseconds
+from chainshaper.values.files import write_whole
 from chainshaper.verify.measure import PARTS, Comparison, Measurement, hop_breakdown, part_shares
 from chainshaper.verify.overruns import (
     dropped_text,
@@ -136,6 +139,12 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
         entries.append(entry)
     about = {"format": JSON_FORMAT, "chain": comparison.chain, "remark": comparison.remark}
     return {**about, "recordings": entries}
+
+
+def write_comparison_json(comparison: Comparison, folder: Path) -> Path:
+    """Write `comparison.json` into a folder. Raises OperationError: it cannot be written."""
+    text = json.dumps(comparison_json(comparison), indent=2) + "\n"
+    return write_whole(folder / "comparison.json", [text.encode()])
 
 
 def comparisons_json(comparisons: Sequence[Comparison]) -> dict[str, Any]:

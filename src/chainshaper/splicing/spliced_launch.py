@@ -112,6 +112,11 @@ def _file_of_package(package: str, name: str) -> Path:
     shares = [Path(prefix) / "share" for prefix in prefixes]
     index = Path("ament_index/resource_index/packages", package)
     share = next((folder / package for folder in shares if (folder / index).is_file()), None)
+    if share is None and not shares and shutil.which("ros2") is None:
+        raise InputError(
+            f"{package}: ROS 2 is not sourced (no `ros2` on the path): source its setup.bash,"
+            " such as /opt/ros/jazzy/setup.bash, then your workspace's"
+        )
     if share is None:
         raise InputError(
             f"{package}: neither a launch file nor a package of this environment; is it sourced "

@@ -9,10 +9,11 @@ import os
 import platform
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -20,7 +21,7 @@ import polars as pl
 from pydantic import BaseModel, Field
 
 from chainshaper.values.errors import InputError, OperationError, storable
-from chainshaper.values.events import EventTables, as_table, column_problems
+from chainshaper.values.events import EventTables, as_table, column_problems, happened, table
 from chainshaper.values.files import (
     folder_beside,
     free_place,
@@ -122,6 +123,8 @@ class RecordingInfo(BaseModel, frozen=True):
     application: dict[str, Any] | None = None  # the description that ran, when we ran it
     plan: dict[str, Any] | None = None  # the plan in force, when one was
     in_force: InForceInfo | None = None  # None: no plan was in force, or an old version recorded
+    # Of runs that were joined: the times between them (from, until), in which nothing ran.
+    pauses_ns: tuple[tuple[Integer, Integer], ...] = ()
     # File → its CRC-32, as `crc32:89abcdef`; None: an old version recorded, without checksums.
     checksums: dict[str, str] | None = None
 
@@ -289,6 +292,52 @@ def write_recording(
     except (OSError, pl.exceptions.PolarsError) as error:
         raise OperationError(f"{path}: the recording cannot be written: {error}") from error
     return open_recording(path)
+
+
+def join_runs(runs: Sequence[Recording], output: str | Path) -> Recording:
+    """Write the recordings of runs of an application, one behind the other, as one recording.
+
+    The chains go on through them, as through nodes that were started again. Where a plan was in
+    force, only what happened then is in it. Raises: as :func:`write_recording`.
+    """
+    *_, last = (run.info for run in runs)
+    tables = [
+        dict(run.events)
+        if run.info.in_force is None
+        else happened(run.events, run.info.in_force.since_ns, run.info.in_force.until_ns)
+        for run in runs
+    ]
+    spans = [_span(events) for events in tables]
+    pauses = tuple((ended, begun) for (_, ended), (begun, _) in pairwise(spans))
+    meters = [run.info.stall_meter for run in runs if run.info.stall_meter is not None]
+    lost = Counter[str]()
+    for run in runs:
+        lost.update(run.info.lost)
+    joined = {
+        "processes": {pid: name for run in runs for pid, name in run.info.processes.items()},
+        "threads": tuple(thread for run in runs for thread in run.info.threads),
+        "endpoints": tuple(endpoint for run in runs for endpoint in run.info.endpoints),
+        "notes": tuple(dict.fromkeys(note for run in runs for note in run.info.notes)),
+        "realtime": None
+        if any(run.info.realtime is None for run in runs)
+        else all(run.info.realtime for run in runs),
+        "lost": dict(lost),
+        "stall_meter": meters[-1].model_copy(
+            update={"wakeups": sum(meter.wakeups for meter in meters)}
+        )
+        if len(meters) == len(runs)
+        else None,
+        "in_force": None,  # throughout, if at all
+        "pauses_ns": pauses,
+        "checksums": None,
+    }
+    return write_recording(output, tables, last.model_copy(update=joined))
+
+
+def _span(tables: EventTables) -> tuple[int, int]:
+    """When the first and the last callback of a run started (ns)."""
+    starts = table(tables, "callback_start")["time"]
+    return int(starts.min() or 0), int(starts.max() or 0)  # type: ignore[arg-type]
 
 
 def _write_parts(folder: Path, parts: Iterable[EventTables]) -> dict[str, str]:

@@ -189,7 +189,7 @@ def _measured(
     for chain in chains:
         spec = chain_of(recording, chain, flow)
         begun = _in_front(spec, joint)
-        measured = analyse_latency(flow, begun, due=due, between=spell)
+        measured = analyse_latency(flow, begun, due=due, between=spell, pauses=info.pauses_ns)
         notes = (*taken_chain(recording, chain, spec), *info.notes, *measured.notes)
         analysis = replace(measured, notes=notes)
         output = analysis.chain.topics[-1]

@@ -17,6 +17,8 @@ process, since a thread of the loader would wait for the interpreter's lock.
 
 import ctypes
 import os
+import platform
+import re
 import resource
 import struct
 import subprocess
@@ -80,7 +82,7 @@ _CAPABILITIES = {"CAP_IPC_LOCK": 14, "CAP_SYS_ADMIN": 21, "CAP_PERFMON": 38, "CA
 def missing() -> str | None:
     """Say why there can be no sched_ext servers here, with the remedy; None: there can."""
     if not SCHED_EXT.is_dir():
-        return "this kernel has no sched_ext: use Linux 6.12 or newer with CONFIG_SCHED_CLASS_EXT"
+        return _without_sched_ext(platform.release())
     if not KERNEL_TYPES.exists():
         return f"this kernel has no {KERNEL_TYPES}: use one with CONFIG_DEBUG_INFO_BTF"
     try:
@@ -95,6 +97,14 @@ def missing() -> str | None:
     if (scheduler := scheduler_in_force()) is not None:
         return f"sched_ext scheduler {scheduler} is in force, and there can be one only: end it"
     return None
+
+
+def _without_sched_ext(release: str) -> str:
+    """Say why a kernel of this release has no sched_ext, and the remedy."""
+    numbers = [int(number) for number in re.findall(r"\d+", release)[:2]]
+    if numbers >= [6, 12]:
+        return f"this kernel ({release}) was built without CONFIG_SCHED_CLASS_EXT: use one with it"
+    return f"this kernel ({release}) has no sched_ext: use Linux 6.12 or newer"
 
 
 def is_realtime_kernel() -> bool:

@@ -12,8 +12,9 @@ from chainshaper.sources.preload.memory import RefusedMemoryError, TracedProcess
 from chainshaper.values.errors import InputError, text_of
 
 NO_PROCESS = (
-    "no process of these users runs with the library in front: set what `chainshaper watch "
-    "--environment` prints before the application is started, or name its user (--user)"
+    "nothing is being traced: no process of these users runs with the library in front. Start "
+    "the robot with `chainshaper watch -- ros2 launch …`, or set what `chainshaper watch "
+    "--environment` prints before it is started, or name its user (--user)"
 )
 _MEMORY = re.compile(rb"/memfd:chainshaper-trace\b")
 
