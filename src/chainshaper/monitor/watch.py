@@ -647,7 +647,7 @@ def _values(seen: Seen) -> Iterator[tuple[str, float, dict[str, str]]]:
     for chain in seen.chains:
         named = {"chain": chain.chain}
         for span, figures in chain.spans.items():
-            statistics = {"min": figures.min_ns, "max": figures.max_ns}
+            statistics: dict[str, int | None] = {"min": figures.min_ns, "max": figures.max_ns}
             for percentile, ns in figures.percentiles_ns.items():
                 statistics[f"p{percentile}"] = ns
             for statistic, ns in statistics.items():
