@@ -50,6 +50,11 @@ test-kernel: .venv/.ready-dev
 core = $(shell find core -name '*.[ch]pp')
 # C++ that is not in the library: shaping nodes, the gates in front of rmw, the described nodes.
 nodes = $(shell find src/chainshaper -name '*.[ch]pp')
+# Of these, what the build compiles, since it needs no headers of ROS 2. Those of the nodes need them:
+# scripts/lint-nodes checks them where a ROS 2 is sourced, or ROS2_SETUP names its setup.bash.
+in_front_of_rmw = $(shell find src/chainshaper/robot/rmw -name '*.[ch]pp')
+# The folder of the last build of the library.
+built = $(dir $(firstword $(shell ls -t build/cp*/compile_commands.json)))
 
 # The native library by itself, without Python, under sanitizers; each fuzz target runs for so many
 # seconds: `make core-tests FUZZ_SECONDS=36000` is a campaign.
@@ -67,8 +72,9 @@ lint: .venv/.ready-dev
 	nice .venv/bin/mypy
 	nice .venv/bin/lint-imports --no-cache
 	.venv/bin/clang-format --dry-run --Werror $(core) $(nodes)
-	nice .venv/bin/clang-tidy --quiet -p $(dir $(firstword $(shell ls -t build/cp*/compile_commands.json))) \
-		$(filter-out core/tests/% core/fuzz/%,$(filter %.cpp,$(core)))
+	nice .venv/bin/clang-tidy --quiet -p $(built) \
+		$(filter-out core/tests/% core/fuzz/%,$(filter %.cpp,$(core))) $(filter %.cpp,$(in_front_of_rmw))
+	nice scripts/lint-nodes .venv/bin/clang-tidy $(built)preloaded/include
 
 # Needs a quiet machine and about a quarter of an hour; prints tables, asserts nothing.
 benchmark: .venv/.ready-dev

@@ -65,8 +65,8 @@ def without_disproved_ends(
     rule no other step needs these large tables.
     """
     thread, key = ["pid", "tid"], ["tid", "callback_id"]
-    takes = taken.filter(~pl.col("intra_process")).drop_nulls("callback_id")
-    takes = takes.select(*key, took="time")
+    from_dds = taken.lazy().filter(~pl.col("intra_process")).drop_nulls("callback_id")
+    takes = from_dds.select(*key, took="time").collect()
     rows = first_after(instances, takes, key, "start", "took", strictly=True)
     if not _suspicious(rows):
         return LostEnds(instances.with_columns(until=_NO_TIME), _NONE, _NONE, complete)
@@ -111,7 +111,7 @@ def _executions_of_timers(tables: events.EventTables, callbacks: pl.DataFrame) -
 
 
 def _suspicious(rows: pl.DataFrame) -> bool:
-    """Whether some instance may be two.
+    """Return whether one of the instances may be two, because events were lost.
 
     It may be if the callback's next take lies inside it; or if it has no end and another instance
     began on its thread; or if it is longer than usual, and not much shorter than starts are apart.

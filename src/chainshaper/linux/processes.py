@@ -45,7 +45,8 @@ from chainshaper.values.middleware import (
 
 _AT_UID = 11
 _AUXILIARY = struct.Struct("@NN")
-_RULE = re.compile(
+# Remap rules that name nodes. Those for topics are in splicing/redirection.py, which stands alone.
+_NODE_NAME_RULE = re.compile(
     r"(?:([A-Za-z_]\w*):)?__(?:(?:node|name):=([A-Za-z_]\w*)|ns:=(/|(?:/[A-Za-z_]\w*)+))", re.ASCII
 )
 _WITH_VALUE = {"-p", "--param", "--params-file", "-e", "--enclave"}
@@ -303,7 +304,7 @@ def named_nodes(command: Sequence[str]) -> tuple[str, ...]:
     """
     names: dict[str | None, str] = {}
     namespaces: dict[str | None, str] = {}
-    for rule in filter(None, map(_RULE.fullmatch, _remap_rules(command))):
+    for rule in filter(None, map(_NODE_NAME_RULE.fullmatch, _remap_rules(command))):
         owner, name, namespace = rule.groups()
         remapped = names if name else namespaces
         if None not in remapped:  # rules behind one for all nodes never apply
