@@ -31,7 +31,7 @@ from results import ROS, Column, Run, earlier_runs
 
 from chainshaper import generate_package, open_recording, shape_launch
 from chainshaper.flow.launch_shaping import plan_in_force
-from chainshaper.flow.profiling import chain_nodes, profiled_cores, profiling_condition
+from chainshaper.flow.profiling_condition import chain_nodes, profiled_cores, profiling_condition
 from chainshaper.flow.record import record_command
 from chainshaper.linux.processes import run_users
 from chainshaper.planning import PlanRequest, load_plan

@@ -44,10 +44,10 @@ from chainshaper.analysis import data_flow
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.flow.plan import profile_chains
 from chainshaper.planning import ChainPlan, PlanRequest, plan_application
-from chainshaper.planning.margins import OVERRUN_PROBABILITY
+from chainshaper.planning.margins import OVERRUN_PROBABILITY, allowed_late_share
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
-from chainshaper.verify.promises import outputs_due, promised_by
+from chainshaper.verify.promises import outputs_due
 
 MS = 1_000_000
 HARMONIC_MS = ((20, 40, 80), (25, 50, 100), (50, 100, 200), (100,))
@@ -211,7 +211,7 @@ def outcome(shaped: Recording, flow: DataFlow, plan: ChainPlan) -> dict[str, Any
     from scipy.stats import binom
 
     measured = measure_latency(shaped, plan.chain.spec, flow=flow)
-    outputs, promised = outputs_due(measured.analysis, plan), promised_by(plan)
+    outputs, promised = outputs_due(measured.analysis, plan), allowed_late_share(plan.margin)
     missed = outputs.missed
     likely = float(binom.sf(missed - 1, outputs.due, promised)) if missed else 1.0
     found = {

@@ -7,7 +7,7 @@
 namespace chainshaper::ctf {
 namespace {
 
-// If all bytes of a header are zeros, and so many behind it, there is no event.
+// A header of zeros, with so many more bytes of zeros behind it, is no event.
 constexpr std::int64_t zeros_of_no_event = 32;
 
 // Bytes ahead of an event that are fetched while it is read.
@@ -40,6 +40,7 @@ public:
     return run_.steps(stream_.packet_context, content_, header.bits());
   }
 
+  // Reads an event's header, and sets the clock.
   Header read(std::int64_t position) const {
     if (const auto & quick = stream_.quick; quick.align != 0) {
       const auto at = align_up(position, quick.align);
@@ -47,7 +48,7 @@ public:
       const auto byte = static_cast<std::size_t>(at >> 3);
       if (behind <= content_.end && byte + 8 <= content_.bytes.size()) {
         const auto * place = content_.bytes.data() + byte;
-        // Waiting for the memory of the next headers would take most of the time.
+        // Without this, waiting for the memory of the next headers would take most of the time.
         if (byte + read_ahead < content_.bytes.size()) __builtin_prefetch(place + read_ahead);
         const auto word = load<std::uint64_t>(place);
         const auto last = low_bits(~std::uint64_t{0}, quick.id_bits);
@@ -98,7 +99,8 @@ private:
   Run & run_;
 };
 
-// Whether a header and the bytes behind it are zeros, as where a disk has not got the data.
+// Whether a header and the bytes behind it are zeros, as in a file whose data never reached the
+// disk.
 bool only_zeros(const Content & content, std::int64_t position, std::int64_t behind) {
   const auto first = position >> 3, last = (behind >> 3) + zeros_of_no_event;
   if (last > content.end >> 3) return false;
@@ -113,9 +115,9 @@ bool is_zero(const Content & content, std::int64_t position) {
          load<std::uint32_t>(content.bytes.data() + static_cast<std::size_t>(at)) == 0;
 }
 
-// Checks that a tracer can have written an event whose header is from `position` to `behind`: it
-// happened while its packet was open, in a process, and its bytes are not all zeros. Returns
-// `behind`, or what is wrong.
+// Checks that a tracer can have written an event, whose header is from `position` to `behind`: it
+// happened while its packet was open, in a process with a number, and its bytes are not all zeros.
+// Returns `behind`, or what is wrong.
 Reached believed(const Headers & headers, const PacketEvents & packet, const Run & run,
                  std::int64_t position, std::int64_t behind, const EventLayout * event_of_id_0,
                  const EventLayout * event) {
@@ -134,7 +136,7 @@ Reached believed(const Headers & headers, const PacketEvents & packet, const Run
   return behind;
 }
 
-// Nanoseconds of so many cycles, rounded down.
+// Converts clock cycles to nanoseconds, rounded down.
 std::int64_t nanoseconds(std::uint64_t cycles, std::int64_t frequency_hz) {
   constexpr std::uint64_t billion = 1'000'000'000;
   const auto rate = static_cast<std::uint64_t>(frequency_hz);
@@ -142,13 +144,13 @@ std::int64_t nanoseconds(std::uint64_t cycles, std::int64_t frequency_hz) {
   return static_cast<std::int64_t>(cycles / rate * billion + cycles % rate * billion / rate);
 }
 
-// Events of one class and of constant layout, written together: column by column, without a branch
-// for each value.
+// Events of a class of constant layout that are written together, column by column, so that there
+// is no branch for each value.
 struct Batch {
   static constexpr std::size_t most = 128;
 
   std::size_t count{0};
-  std::size_t first_row{0};  // of their table; the others follow it
+  std::size_t first_row{0};  // of the first event; the rows of the others follow
   std::array<const std::uint8_t *, most> places{};
 
   bool is_followed_by(std::size_t row) const { return count < most && first_row + count == row; }
@@ -200,7 +202,7 @@ public:
     return end;
   }
 
-  // Writes what still waits; whether all rows were written that were expected.
+  // Writes the batches that are not written yet; returns whether all expected rows were written.
   bool finish() {
     for (std::size_t number = 0; number < batches_.size(); ++number)
       move(layout_.events[number], batches_[number]);
@@ -248,8 +250,8 @@ private:
   const Layout & layout_;
   Bytes file_;
   std::span<const TableColumns> tables_;
-  std::vector<std::int64_t> rows_;  // the next one of each table
-  std::vector<std::int64_t> ends_;  // the one behind the last
+  std::vector<std::int64_t> rows_;  // the next row of each table
+  std::vector<std::int64_t> ends_;  // the end of the rows of each table
   std::vector<Batch> batches_;      // per event class
   Texts texts_;
 };

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from chainshaper.flow.plan import plan_recording as plan_recording
     from chainshaper.flow.plan import profile_chains as profile_chains
     from chainshaper.flow.planned_changes import planned_changes as planned_changes
-    from chainshaper.flow.profiling import profiling_condition as profiling_condition
+    from chainshaper.flow.profiling_condition import profiling_condition as profiling_condition
     from chainshaper.flow.record import Recorded as Recorded
     from chainshaper.flow.record import record_command as record_command
     from chainshaper.flow.sweep import sweep as sweep

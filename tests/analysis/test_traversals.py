@@ -279,7 +279,7 @@ def test_what_waited_and_what_was_not_used_in_budget_table_and_page(tmp_path: Pa
     shorter = chain.hops[1].model_copy(update={"waiting_ns": 19 * ms})
     budget = Budget(chains=(chain.model_copy(update={"hops": (shorter,)}),))
     (broken,) = [one for one in check_budget(recording, budget) if not one.met]
-    assert (broken.what, broken.found) == ("waiting of /plan", 20 * ms)
+    assert (broken.figure, broken.measured) == ("waiting of /plan", 20 * ms)
     budget = Budget(chains=(ChainBudget(chain="/image../plan", maximum_ns=ms),))
     (broken,) = check_budget(recording, budget)
     assert broken.because == "its longest hop is /planner (20 ms of waiting on average to /plan)"

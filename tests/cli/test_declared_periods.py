@@ -90,7 +90,7 @@ def test_names_of_callbacks_are_the_same_in_every_run(
     limits = load_budget(budget)
     found = [check_budget(open_source(one), limits)[0] for one in (as_declared, faster)]
     assert [one.where for one in found] == ["/camera (every 100ms)", f"/camera ({BOTH})"]
-    assert [one.found for one in found] == [2 * MS, 2 * MS]
+    assert [verdict.measured for verdict in found] == [2 * MS, 2 * MS]
     samples = [sample_of(open_source(one)) for one in (as_declared, faster)]
     assert samples[0].callbacks.keys() == samples[1].callbacks.keys()
     compared, _ = slowdowns_in([faster], [as_declared])

@@ -34,7 +34,7 @@ from processes import wait_for
 from chainshaper.enforcement import undoing
 from chainshaper.enforcement.guardian import GROUP
 from chainshaper.enforcement.journal import find_journals
-from chainshaper.linux import own_processes
+from chainshaper.linux import child_processes
 from chainshaper.linux.cgroups import cgroup_of, mount_options, mount_point
 from chainshaper.linux.scheduling import state_of
 from chainshaper.linux.threads import list_threads
@@ -177,7 +177,7 @@ def test_a_run_that_is_ending_its_command_is_waited_for(
 ) -> None:
     """Killed, it would leave the command running. What ending one takes: three times 0.5 s here."""
     monkeypatch.setattr(undoing, "PATIENCE_S", 0.2)
-    monkeypatch.setattr(own_processes, "PATIENCE_S", 0.5)
+    monkeypatch.setattr(child_processes, "PATIENCE_S", 0.5)
     command = [sys.executable, "-c", SLOW, str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as owner:
         assert known(owner.stdout).readline() == b"ready\n"

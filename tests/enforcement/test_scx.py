@@ -30,7 +30,7 @@ from chainshaper.enforcement.scx.back_end import (
     unpack_exit,
 )
 from chainshaper.enforcement.servers import ReservationServer, ServerCounters, ServerTable
-from chainshaper.linux.own_processes import what_happened
+from chainshaper.linux.child_processes import what_happened
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
 pytestmark = pytest.mark.timed

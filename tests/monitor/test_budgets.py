@@ -75,13 +75,13 @@ def test_a_slower_callback_breaks_limits_and_is_named(
     recording: Recording, slowed: Recording
 ) -> None:
     broken = [one for one in check_budget(slowed, propose_budget(recording)) if not one.met]
-    found = {(one.where, one.what) for one in broken}
+    found = {(one.where, one.figure) for one in broken}
     assert {("/t1../t3", "maximum"), ("/t1../t3", "p50"), ("/t1../t3", "p99")} <= found
     assert ("/t1../t3", "computation of /t2") in found
     assert {("/second (/t1)", "response"), ("/second (/t1)", "execution")} <= found
     assert not any("/third" in where or "/first" in where for where, _ in found)
-    (maximum,) = (one for one in broken if one.what == "maximum")
-    assert maximum.found == measure_latency(slowed).analysis.statistics.max_ns
+    (maximum,) = (one for one in broken if one.figure == "maximum")
+    assert maximum.measured == measure_latency(slowed).analysis.statistics.max_ns
     assert "from computation of /t2" in (maximum.because or "")
     assert maximum.text.startswith("/t1../t3: maximum ")
 
@@ -118,7 +118,7 @@ def test_missing_counts_late_outputs_and_those_that_never_came(
     """Every tenth message of /t2 is not taken; the last is under way and does not count."""
     budget = Budget(chains=(ChainBudget(chain="/t1../t3", missing=0.05),))
     (judged,) = check_budget(without_takes(recording, tmp_path / "holes", 0, 10), budget)
-    assert judged.found == pytest.approx(0.1, abs=0.006)
+    assert judged.measured == pytest.approx(0.1, abs=0.006)
     assert not judged.met
     assert "missing 10" in judged.text
 
@@ -209,7 +209,7 @@ def test_outputs_are_missing_of_a_chain_whose_last_node_died(
 ) -> None:
     budget = Budget(chains=(ChainBudget(chain="/t1../t3", maximum_ns=MS, missing=0.01),))
     longest, gone = check_budget(without_takes(recording, tmp_path / "ending", after), budget)
-    assert gone.found == pytest.approx(missing, abs=0.006)
+    assert gone.measured == pytest.approx(missing, abs=0.006)
     assert not (longest.met or gone.met)
     assert ("no cycle was complete" in longest.text) == (after == 0)
 
@@ -225,6 +225,6 @@ def test_of_callbacks_with_one_name_the_longest_counts(recording: Recording) -> 
     both = {name: pl.concat([recording.events[name], table]) for name, table in again.items()}
     whole = replace(recording, events={**recording.events, **both})
     budget = propose_budget(recording, room=0.1)
-    judged = {(one.where, one.what): one for one in check_budget(whole, budget)}
+    judged = {(one.where, one.figure): one for one in check_budget(whole, budget)}
     limit = judged["/second (/t1)", "response"]
-    assert limit.found == pytest.approx(limit.limit / 1.1 + 2 * MS, abs=20_000)
+    assert limit.measured == pytest.approx(limit.limit / 1.1 + 2 * MS, abs=20_000)

@@ -104,7 +104,7 @@ def test_cycles_that_never_arrive_are_counted_while_a_node_is_dead_and_once_afte
     assert first.at_ns < before.at_ns + 10 * SECOND
     for seen in (first, dead[-1]):  # as long as it is dead
         (missing,) = broken_limits(BUDGET, seen)
-        assert missing.what == "missing"
+        assert missing.figure == "missing"
     assert "no path leads" in (missing.because or "")
     rates = [counted(b)["incomplete"] - counted(a)["incomplete"] for a, b in pairwise(dead[5:])]
     assert set(rates) == {2 * 70}, "fifty and twenty cycles a second"

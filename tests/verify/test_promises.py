@@ -22,6 +22,7 @@ from chainshaper import (
 )
 from chainshaper.planning import Plan, PlanRequest
 from chainshaper.planning.chain_plan import Margin, revised
+from chainshaper.planning.margins import OVERRUN_PROBABILITY
 from chainshaper.reporting.latency import comparison_table, verdict
 from chainshaper.values import events
 from chainshaper.values.errors import InputError
@@ -171,9 +172,10 @@ def test_the_verdict_has_the_bound_that_it_judges_by(tmp_path: Path) -> None:
     )
 
 
-def test_a_given_margin_that_shows_nothing_promises_that_no_output_is_late(tmp_path: Path) -> None:
+def test_a_margin_that_names_no_share_allows_the_default_one(tmp_path: Path) -> None:
     recording = known_run(tmp_path / "rec", 60, overran=(7,))
     measured = measure_latency(recording)
     plan = revised(known(measured.plan), margin=Margin(epsilon_ns=MS))
     outputs = outputs_due(measured.analysis, plan)
-    assert (outputs.late, outputs.most_missed, outputs.kept) == (1, 0, False)
+    assert (outputs.late, outputs.promised) == (1, OVERRUN_PROBABILITY)
+    assert (outputs.most_missed, outputs.kept) == (2, True)

@@ -59,7 +59,7 @@ def close_names(name: str, names: Iterable[str]) -> list[str]:
 
 
 def _likeness(first: str, second: str) -> float:
-    """How alike two names are, from 0 to 1."""
+    """Return how alike two names are, from 0 to 1."""
     a, b = (text.lower().strip("/") for text in (first, second))
     last_a, last_b = a.rpartition("/")[2], b.rpartition("/")[2]
     return max(
@@ -70,7 +70,7 @@ def _likeness(first: str, second: str) -> float:
 
 
 def parse_chain(text: str) -> tuple[str, ...]:
-    """The way points of a chain: ``/t1../t5`` → ``("/t1", "/t5")``.
+    """Return the way points of a chain: ``/t1../t5`` → ``("/t1", "/t5")``.
 
     Raises InputError: nothing between two dots, more than two dots in a row, a way point twice.
     """
@@ -171,7 +171,7 @@ def _chain(graph: ApplicationGraph, spec: str | None, path: GraphPath) -> Chain:
 
 
 def _way_points(graph: ApplicationGraph, chain: Chain) -> Iterator[str]:
-    """The topics of a chain, and its nodes where others of their name ran at the same time."""
+    """Yield the topics of a chain, and nodes that share their name with another running node."""
     for callback, topic in zip(graph.path(chain), chain.topics, strict=True):
         if (node := graph.node_text(callback)) != callback.node:
             yield node
@@ -179,7 +179,7 @@ def _way_points(graph: ApplicationGraph, chain: Chain) -> Iterator[str]:
 
 
 def _ambiguous(graph: ApplicationGraph, spec: str, chains: Sequence[Chain], complete: bool) -> str:
-    """Message for a text that several chains match: each of them, with what sets it apart."""
+    """Return the message for a text that several chains match: each, with what sets it apart."""
     more = "" if complete and len(chains) <= HANDFUL else "at least "
     lines = [f"chain {spec!r}: {more}{len(chains)} paths match; add a way point:"]
     shown = chains[:HANDFUL]
@@ -214,7 +214,7 @@ def _without_way_point(path: Sequence[Callback], paths: Sequence[Sequence[Callba
 
 
 def _some(names: Iterable[str]) -> str:
-    """A handful of names for a message."""
+    """Return a handful of names for a message."""
     listed = sorted(names)
     return ", ".join(listed[:HANDFUL]) + (", ..." if len(listed) > HANDFUL else "")
 
@@ -462,7 +462,7 @@ class _Search:
         return paths, True
 
     def _returns(self, path: GraphPath) -> bool:
-        """Whether each response on the path goes to the node that sent the request."""
+        """Return whether each response on the path goes to the node that sent the request."""
         callers: dict[Vertex, tuple[int, str]] = {}
         for vertex, after in pairwise((*path, "")):
             if not isinstance(vertex, int):
@@ -658,7 +658,7 @@ def load_named_paths(file: str | Path) -> dict[str, str]:
 
 
 def _paths_of_callbacks(file: Path, architecture: _ArchitectureOfGalactic) -> dict[str, str]:
-    """The chains of paths that name their callbacks, as ``/node/subscription_callback_0``.
+    """Return the chains of paths that name their callbacks, as ``/node/subscription_callback_0``.
 
     A message leads from a callback to the next node's, so its topic is a way point. Between two
     callbacks of one node there is a variable: the node is the way point.
@@ -669,8 +669,8 @@ def _paths_of_callbacks(file: Path, architecture: _ArchitectureOfGalactic) -> di
         points: list[str] = []
         for number, unique_name in enumerate(alias.callbacks):
             node_name, _, callback_name = unique_name.rpartition("/")
-            known = nodes[node_name].callbacks if node_name in nodes else ()
-            callback = next((c for c in known if c.callback_name == callback_name), None)
+            callbacks = nodes[node_name].callbacks if node_name in nodes else ()
+            callback = next((c for c in callbacks if c.callback_name == callback_name), None)
             if callback is None:
                 where = f"{file}: path {alias.path_name!r}"
                 raise InputError(
@@ -690,7 +690,7 @@ def _paths_of_callbacks(file: Path, architecture: _ArchitectureOfGalactic) -> di
 
 
 def _published(node: _Node, callback_name: str) -> str | None:
-    """The topic that a callback publishes; None if the file has none, or does not say which."""
+    """Return the topic that a callback publishes; None: the file does not say."""
     of_callback = [
         publication.topic_name
         for publication in node.publishes

@@ -105,7 +105,7 @@ def clock_text(time_ns: int) -> str:
 
 
 def _moved_clock(stamped: StampedMessages | None) -> Iterator[Contradiction]:
-    """The wall clock was moved while messages were recognised by its time alone."""
+    """Yield a moved wall clock, where messages are recognised by its time alone."""
     if stamped is None or not stamped.moves:
         return
     first, total = stamped.moves[0], sum(move.by_ns for move in stamped.moves)
@@ -149,7 +149,7 @@ def _before_their_publication(
 
 
 def _without_takes(subscription: UnseenTakes) -> Contradiction:
-    """A callback ran, but no event shows a take of its message."""
+    """Report a callback that ran although no event shows a take of its message."""
     first = f"the first {clock_text(subscription.first_ns)} in thread {subscription.tid}"
     problem = (
         f"the callback of {subscription.node} for {subscription.topic} ran without any event of a"
@@ -177,7 +177,7 @@ def _without_takes(subscription: UnseenTakes) -> Contradiction:
 
 
 def _of_another_period(timer: ShownPeriod) -> Contradiction:
-    """A timer's callback starts at another period than declared."""
+    """Report a timer whose callback starts at another period than declared."""
     declared = duration_text(timer.declared_ns)
     declared_only = (
         f"the timer of {timer.node} was created with a period of {declared}, but its callback"
@@ -196,7 +196,7 @@ def _of_another_period(timer: ShownPeriod) -> Contradiction:
 
 
 def _longer_than_they_ran(nodes: pl.DataFrame, ends: LostEnds) -> Iterator[Contradiction]:
-    """Callbacks span their executor's next take, or its search for work."""
+    """Report callbacks that span their executor's next take, or its search for work."""
     lost = "their ends and the starts after them were lost, so they have no end"
     if ends.complete:
         doubt = "it spins an executor itself now and then, or losses were not counted; they count"

@@ -159,22 +159,22 @@ def timer_due(starts: pl.Series, period_ns: int) -> pl.Series:
 
 
 def due_within(flow: DataFlow, chain: Chain, due: Due | None) -> int | None:
-    """How long after its chain began an output is late at any rate (ns; None: not known).
+    """Return the latency from which on an output is late (ns); None: not known.
 
-    That is at the end of the cycle in which it is due. Without a plan the period of the timer that
-    starts the chain is the cycle.
+    The output is late at the end of the cycle in which it is due. Without a plan, the cycle is the
+    period of the timer that starts the chain.
     """
     return timer_period(flow, chain) if due is None else (due.cycles + 1) * due.cycle_ns
 
 
 def timer_period(flow: DataFlow, chain: Chain) -> int | None:
-    """The period of the timer that starts a chain, as its starts show it (ns; None: no timer)."""
+    """Return the period that a chain's timer shows (ns); None: no timer starts the chain."""
     first = flow.objects.callbacks.filter(pl.col("callback_id") == chain.callbacks[0])
     return first["period_ns"].max()  # type: ignore[return-value]
 
 
 def lateness_in_cycle(starts: pl.Series, cycle_ns: int) -> pl.Series:
-    """How long after the start of its cycle each chain began (ns).
+    """Return how long after the start of its cycle each chain began (ns).
 
     No event shows when cycles start. So the chains' places in the cycle are looked at: the one that
     follows the widest gap between them is the earliest, and came a wake-up after the start.
@@ -189,7 +189,7 @@ def lateness_in_cycle(starts: pl.Series, cycle_ns: int) -> pl.Series:
 
 
 def _cycles_behind(cycle_ns: int | None) -> pl.Expr:
-    """How long before the gate's cycle the chain's own cycle began: whole cycles (ns).
+    """Return how long before the gate's cycle the chain's own cycle began: whole cycles (ns).
 
     A chain may begin a little before its cycle does, by a tenth of the cycle at most.
     """
@@ -274,7 +274,7 @@ def _queued_behind(hit: Mask, start: Times, busy_until: Times, may_queue: Mask) 
 
 
 def stalled_within(start: Times, end: Times, began: Times, ended: Times, core: Times) -> Times:
-    """How much time each window [start, end] lost to stalls of a core; the worst core counts (ns).
+    """Return how much time (ns) each window [start, end] lost to stalls, on the worst core.
 
     A gate and a meter may both have seen one stall: where stalls overlap, each ns counts once. The
     time lost in a window is the difference of two sums: what stalls took until its end, and until

@@ -185,7 +185,7 @@ def data_flow(
 def _notes(
     tables: events.EventTables, instances: pl.DataFrame, taken: pl.DataFrame, without_rmw: int
 ) -> Iterator[str]:
-    """What cannot be known of instances and messages, in plain words.
+    """Yield what cannot be known of instances and messages, in plain words.
 
     ``without_rmw`` is what `_taken_without_rmw` returns.
     """
@@ -218,7 +218,7 @@ def _taken_without_rmw(tables: events.EventTables) -> int:
 
 
 def left_when_taken(flow: DataFlow, topics: Collection[str | None]) -> DataFlow:
-    """The flow in which each message on ``topics`` left when its first reader took it.
+    """Return the flow in which each message on ``topics`` left when its first reader took it.
 
     It is for topics that the publisher's thread of ROS 2 sends: events show only when a message was
     handed to that thread. A flow with events of the sending itself stays as it is.
@@ -282,12 +282,12 @@ def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> p
 
 
 def cpu_time(tables: events.EventTables, spans: pl.DataFrame) -> pl.Series:
-    """CPU time (ns) of thread ``tid`` between ``start`` and ``end`` of each row of ``spans``.
+    """Return the CPU time (ns) of each row of ``spans``: of ``tid`` between ``start`` and ``end``.
 
-    From `sched_switch`, and exact: the time the thread had used at its last switch plus, if that
-    switched it in, the time since. A thread whose first switch takes it off its core counts as
-    running since the recording began. Null without an end, and for threads that never appear in
-    `sched_switch`.
+    It comes from `sched_switch`, and is exact: the time that the thread had used at its last switch
+    plus, if that switched it in, the time since. A thread whose first switch takes it off its core
+    counts as running since the recording began. Null without an end, and for threads that never
+    appear in `sched_switch`.
     """
     curve = _running_time(tables)
     rows = spans.select("tid", "start", "end").with_row_index("row")
@@ -300,7 +300,7 @@ def cpu_time(tables: events.EventTables, spans: pl.DataFrame) -> pl.Series:
 
 
 def _plausible(frame: pl.DataFrame) -> pl.DataFrame:
-    """The frame without values of ``execution_ns`` that cannot be: who runs uses CPU time.
+    """Return the frame without execution times of 0, which are impossible.
 
     Where most instances of a thread used none, `sched_switch` speaks of another thread with the
     same number (the trace was taken inside a container): all its values go. Where few used none,
@@ -480,7 +480,7 @@ def _published_in(
 
 
 def _with_restarts(flow: DataFlow) -> DataFlow:
-    """The flow in which a node that was started again is one node, with a note for each.
+    """Return the flow in which a node that was started again is one node, with a note for each.
 
     Its callbacks are those of its last process. A callback replaces one of an earlier process that
     has the same node, kind and trigger.

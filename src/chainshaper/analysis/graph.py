@@ -82,7 +82,7 @@ def graph_of(flow: DataFlow) -> ApplicationGraph:
 
 
 def _passed_on(callback: Callback, siblings: list[Callback]) -> set[str]:
-    """The topics that other callbacks of its node publish for a callback."""
+    """Return the topics that other callbacks of its node publish for a callback."""
     published_itself = set(callback.publishes)
     if callback.kind == "service":  # an action's: a thread of the goal publishes as a rule
         action, goal, _ = (callback.topic or "").partition("/_action/send_goal")
@@ -132,7 +132,7 @@ def _in_turns(flow: DataFlow, nodes: Iterable[list[Callback]]) -> dict[int, set[
 
 
 def _outputs(callbacks: list[Callback], kind: str) -> set[str]:
-    """The topics that callbacks of a kind publish."""
+    """Return the topics that callbacks of a kind publish."""
     topics = {
         topic for callback in callbacks if callback.kind == kind for topic in callback.publishes
     }
@@ -147,7 +147,7 @@ def _by_topic(endpoints: pl.DataFrame) -> dict[str, tuple[str, ...]]:
 
 
 def goes_on_elsewhere(graph: ApplicationGraph, callback: Callback, topic: str) -> bool:
-    """Whether a message that ``callback`` reads may leave on ``topic`` through a sibling.
+    """Return whether a message that ``callback`` reads may leave on ``topic`` through a sibling.
 
     It may where the callback passes the topic on, or publishes it in turns. It also may where a
     sibling passes the topic on, for any input may be the last of its set. Where each of several

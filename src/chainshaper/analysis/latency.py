@@ -158,8 +158,8 @@ def longest_times(flow: DataFlow) -> dict[tuple[str, str], Longest]:
     return {(node, starts): Longest(*longest) for node, starts, *longest in rows.iter_rows()}
 
 
-class Executor(NamedTuple):
-    """The threads of a process that run the same callbacks."""
+class RecordedExecutor(NamedTuple):
+    """An executor as a recording shows it: threads of a process that run the same callbacks."""
 
     pid: int
     threads: dict[int, tuple[str, ...]]  # thread id → the nodes whose callbacks it ran
@@ -169,14 +169,14 @@ class Executor(NamedTuple):
     left out: `/clock` may have a thread of its own."""
 
 
-def executors(flow: DataFlow) -> list[Executor]:
+def executors(flow: DataFlow) -> list[RecordedExecutor]:
     """Find the executors of a recording (paper, section 6): groups of callbacks that share threads.
 
     Callbacks that ran on one thread have one executor, and so have all that ran on any of its
     threads. A thread that calls the timers belongs to their executor (rclcpp's events executor). In
     Python the main thread belongs to it as well: it gives the others their work.
     """
-    listed: list[Executor] = []
+    listed: list[RecordedExecutor] = []
     columns_of_runs = ("callback_id", "pid", "tid")
     calls = timer_calls(flow.events, flow.objects).select(columns_of_runs)
     ran = pl.concat([flow.instances.select(columns_of_runs), calls]).unique()
@@ -207,7 +207,7 @@ def executors(flow: DataFlow) -> list[Executor]:
                 callbacks | executor.callbacks,
                 tuple(dict.fromkeys(executor.names + names)),
             )
-        listed.append(Executor(pid, threads, callbacks, names))
+        listed.append(RecordedExecutor(pid, threads, callbacks, names))
     return listed
 
 

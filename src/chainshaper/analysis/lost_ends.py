@@ -111,7 +111,7 @@ def _executions_of_timers(tables: events.EventTables, callbacks: pl.DataFrame) -
 
 
 def _suspicious(rows: pl.DataFrame) -> bool:
-    """Whether some instance may be two.
+    """Return whether one of the instances may be two, because events were lost.
 
     It may be if the callback's next take lies inside it; or if it has no end and another instance
     began on its thread; or if it is longer than usual, and not much shorter than starts are apart.

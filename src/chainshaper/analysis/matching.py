@@ -115,7 +115,7 @@ def _keys(frame: pl.DataFrame, by: list[str]) -> list[npt.NDArray[Any]]:
 
 
 def _as_array(column: pl.Series) -> npt.NDArray[Any]:
-    """A column of integers as an array, nulls as 0; a copy only where there are any."""
+    """Return a column of integers as an array, nulls as 0; a copy only where there are any."""
     known = column.fill_null(0) if column.null_count() else column
     values: npt.NDArray[Any] = known.rechunk().to_numpy()
     return values
@@ -135,7 +135,7 @@ def in_order(frame: pl.DataFrame, time: str, *ties: str, nulls_last: bool = Fals
 
 
 def grows(times: pl.Series) -> bool:
-    """Whether each time is later than the one before it; nulls are ignored."""
+    """Return whether each time is later than the one before it; nulls are ignored."""
     return bool((times.slice(1) > times.head(max(len(times) - 1, 0))).all())
 
 

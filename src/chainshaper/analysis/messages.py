@@ -123,7 +123,7 @@ def _gid_owners(
 
 
 def _gid_text(column: str) -> pl.Expr:
-    """A gid as text, so that frames can be joined by it."""
+    """Return a gid as text, so that frames can be joined by it."""
     return pl.col(column).list.head(_GID).cast(pl.List(pl.String)).list.join(".")
 
 
@@ -233,7 +233,7 @@ def _handed_over(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
 
 
 def taken_by_rmw(tables: events.EventTables) -> pl.DataFrame:
-    """The rows of `rmw_take` in which a message was there to be taken."""
+    """Return the rows of `rmw_take` in which a message was there to be taken."""
     taken = events.table(tables, "rmw_take", ["taken"])
     if (taken["taken"] == 0).any():
         taken = taken.filter(pl.col("taken").fill_null(1) != 0)
@@ -314,7 +314,7 @@ def _dispatched(tables: events.EventTables) -> pl.DataFrame:
 
 
 def has_stampless(published: pl.DataFrame) -> bool:
-    """Whether some message has no source timestamp; requests and responses need none."""
+    """Return whether some message has no source timestamp; requests and responses need none."""
     return _messages(published)["source_timestamp"].null_count() > 0
 
 
@@ -408,7 +408,7 @@ def _with_dispatched(
 
 
 def _messages(published: pl.DataFrame) -> pl.DataFrame:
-    """The publications without the requests and responses of services."""
+    """Return the publications without the requests and responses of services."""
     return published.filter(pl.col("call").is_null()) if "call" in published.columns else published
 
 
@@ -484,7 +484,7 @@ def why_not_sent(
 
 
 def _sends(published: pl.DataFrame, tables: events.EventTables, objects: Objects) -> pl.DataFrame:
-    """The table `asynchronous_send` with the ``publication`` that each row is about."""
+    """Return the table `asynchronous_send` with the ``publication`` that each row is about."""
     publishers = objects.publishers.select("pid", "publisher", rmw_publisher_handle="rmw_handle")
     sends = events.table(tables, "asynchronous_send").rename({"timestamp": "source_timestamp"})
     stamped = published.select("publication", "publisher", "source_timestamp")
@@ -506,7 +506,7 @@ def discarded_instances(
 
 
 def gate_decisions(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
-    """The table `gate_release` with the ``callback_id`` of each gate.
+    """Return the table `gate_release` with the ``callback_id`` of each gate.
 
     A shaping node in ROS 2 does not know the handle of its callback. So a decision of its gate has
     a row for each subscription of its process, and the message's source timestamp decides later

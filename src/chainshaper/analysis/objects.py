@@ -129,7 +129,7 @@ def resolve_objects(tables: events.EventTables) -> Objects:
 
 
 def named_nodes(tables: events.EventTables) -> pl.DataFrame:
-    """The frame ``nodes`` of :class:`Objects`."""
+    """Return the frame ``nodes`` of :class:`Objects`."""
     created = events.table(tables, "rcl_node_init").drop_nulls("node_handle")
     return created.select("pid", handle="node_handle", valid_from="time", node=events.NODE_NAME)
 

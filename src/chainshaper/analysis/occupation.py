@@ -102,7 +102,7 @@ def thread_cores(flow: DataFlow, info: RecordingInfo) -> dict[ThreadKey, int | N
 def _places(
     flow: DataFlow, cores: dict[ThreadKey, int | None]
 ) -> tuple[dict[tuple[int, ...], list[int]], int]:
-    """The ``places`` and ``settled_ns`` of an :class:`Occupation`."""
+    """Return the ``places`` and ``settled_ns`` of an :class:`Occupation`."""
     starts = events.table(flow.events, "callback_start").select("pid", "tid", "cpu", start="time")
     starts = starts.unique(["pid", "tid", "start"], keep="first")
     ran = flow.instances.select("pid", "tid", "start")
@@ -184,8 +184,8 @@ def deliveries(flow: DataFlow, occupied: Occupation) -> pl.DataFrame:
     for row, instance in enumerate(hops["instance"]):
         hop_rows.setdefault(place_of[instance], []).append(row)
     for place, rows in hop_rows.items():
-        there = occupied.places[place]
-        ended = sorted((ends[number], number) for number in there if ends[number] is not None)
+        instances = occupied.places[place]
+        ended = sorted((ends[number], number) for number in instances if ends[number] is not None)
         times = np.array([time for time, _ in ended], np.int64)
         for row in rows:
             _, _, sent_ns, publishing, _, pid, tid, start = hops.row(row)

@@ -57,8 +57,9 @@ def with_outputs_due(
 
 
 def _running_until(flow: DataFlow, since_ns: int, until_ns: int | None) -> int:
-    """The instant until which every node ran, unless it ended by itself (ns), of a run that ended
-    with its recording.
+    """Return the instant until which every node ran, unless it ended by itself (ns).
+
+    It is that of a run that ended with its recording.
     """
     times = flow.instances["start"]
     times = times.filter(times >= since_ns)
@@ -108,7 +109,7 @@ def _not_begun_between(
 
 
 def _stays_behind(behind: npt.NDArray[np.int64], cycle_ns: int) -> npt.NDArray[np.int64]:
-    """By how many whole cycles each beginning, and the next ones, fall behind the one before."""
+    """Return by how many whole cycles each beginning, and all later ones, fall behind."""
     ahead = np.append(behind[1:], np.full(_CATCHES_UP, behind[-1]))
     least = np.lib.stride_tricks.sliding_window_view(ahead, _CATCHES_UP)[: len(behind) - 1]
     rise = least.min(axis=1) - behind[:-1]

@@ -91,7 +91,7 @@ def _off_their_grid(
 
 
 def _too_often(starts: npt.NDArray[np.int64], declared: int) -> bool:
-    """Whether there are more starts than a timer of this period has in their span."""
+    """Return whether there are more starts than a timer of this period has in their span."""
     span, count = float(starts[-1] - starts[0]), len(starts) - 1
     return span < count * declared * (1 - _SAME) - declared
 
@@ -99,7 +99,7 @@ def _too_often(starts: npt.NDArray[np.int64], declared: int) -> bool:
 def _waited_in_vain(
     callbacks: pl.DataFrame, instances: pl.DataFrame, timer: int, declared: int, usual: float
 ) -> bool:
-    """Whether most starts came late although their thread and their node had nothing to do.
+    """Return whether most starts came late although their thread and their node had nothing to do.
 
     Late means: the declared period was over since the start before.
     """
@@ -117,7 +117,7 @@ def _waited_in_vain(
 
 
 def _period(apart: npt.NDArray[np.int64], usual: float) -> int:
-    """The period with the fewest digits that the distances of regular starts agree with (ns)."""
+    """Return the roundest period (ns) that agrees with the distances of regular starts."""
     cycles = int(np.maximum(1, np.round(apart / usual)).sum())
     mean = float(apart.sum() / cycles)
     low, high = np.percentile(apart, (10, 90))

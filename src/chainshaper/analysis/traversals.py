@@ -254,7 +254,7 @@ def _publish_by_sibling(
 
 
 def _keeps_newest(graph: ApplicationGraph, callback: Callback, topic: str) -> bool:
-    """Whether the node stores only the newest of the messages that the callback reads."""
+    """Return whether the node stores only the newest of the messages that the callback reads."""
     if callback.kind == "service":
         return False  # each goal of an action has feedback of its own
     by_timer = any(
@@ -266,7 +266,7 @@ def _keeps_newest(graph: ApplicationGraph, callback: Callback, topic: str) -> bo
 
 
 def _newest_alone(state: pl.DataFrame, hop: int) -> pl.DataFrame:
-    """Of several messages that went into one publication, let only the newest do so.
+    """Keep only the newest of several messages that went into one publication.
 
     The others are marked "not used".
     """

@@ -177,7 +177,7 @@ def _explained(
 
 
 def _price(misfit: int) -> float:
-    """The price of a stamp that lies ``misfit`` ns behind its event, by the distance assumed.
+    """Return the price of assuming that a stamp lies ``misfit`` ns behind its event.
 
     A stamp is never made before the event: a small negative misfit is expensive.
     """

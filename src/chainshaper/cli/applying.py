@@ -82,7 +82,7 @@ def apply(
 
     Whatever ends it, everything is as it was before.
     """
-    from chainshaper.linux.own_processes import end_in_words
+    from chainshaper.linux.child_processes import end_in_words
     from chainshaper.reporting.overviews import changes_table, servers_table
 
     planned = cs.load_plan(plan)

@@ -267,7 +267,7 @@ def record(
 
 def _show_recorded(recorded: "cs.Recorded", *, json: bool) -> None:
     """Show what was recorded. Raises OperationError: the command ended with an error."""
-    from chainshaper.linux.own_processes import end_in_words
+    from chainshaper.linux.child_processes import end_in_words
 
     recording = recorded.recording
     events = int(cs.event_counts(recording)["count"].sum())
@@ -337,7 +337,7 @@ def watch(
     The application needs the library in front of ROS 2: `eval "$(chainshaper watch --environment)"`
     before it is started, or start it here, as COMMAND. Watching needs no root and changes nothing.
     """
-    from chainshaper.linux import own_processes
+    from chainshaper.linux import child_processes
     from chainshaper.linux.processes import run_users
     from chainshaper.monitor.budgets import Budget, load_budget
     from chainshaper.monitor.watch import Watch, exporting
@@ -355,13 +355,13 @@ def watch(
     if budget is not None or recorder != Path():
         refuse_existing(recorder / "watch-DATE-TIME")
     if command:
-        own_processes.check_command(command)
+        child_processes.check_command(command)
     with out.stop_on_signals() as stop, ExitStack() as until:
         started = None
         if command:
             variables = in_front(installed_library())
-            started = own_processes.start_command(command, variables, STDERR)
-            until.callback(own_processes.end_command, started)
+            started = child_processes.start_command(command, variables, STDERR)
+            until.callback(child_processes.end_command, started)
         show = until.enter_context(out.live())
         export = until.enter_context(exporting(metrics, otlp))
         asked = until.enter_context(out.set_by(signal.SIGQUIT))
@@ -389,7 +389,7 @@ def watch(
                 else:
                     show(watch_tables(seen))
     if started is not None and started.returncode and not stop.is_set():
-        raise OperationError(f"the command {own_processes.end_in_words(started.returncode)}")
+        raise OperationError(f"the command {child_processes.end_in_words(started.returncode)}")
 
 
 def _chains_to_watch(
@@ -418,8 +418,8 @@ def _judging(
     def judged(seen: "Seen") -> "list[Judged]":
         nonlocal breaks, named_at, left
         broken = broken_limits(limits, seen)
-        new = [limit.text for limit in broken if (limit.where, limit.what) not in breaks]
-        breaks = {(limit.where, limit.what) for limit in broken}
+        new = [limit.text for limit in broken if (limit.where, limit.figure) not in breaks]
+        breaks = {(limit.where, limit.figure) for limit in broken}
         if new:
             out.say("; ".join(new))
             if left > 0:
@@ -514,8 +514,8 @@ def profile(
     threads are as before. What happened before the priorities were in force is left out, and is no
     part of --duration.
     """
-    from chainshaper.flow.profiling import check_profiling, profiled_cores, undelayed
-    from chainshaper.linux.own_processes import check_command
+    from chainshaper.flow.profiling_condition import check_profiling, profiled_cores, undelayed
+    from chainshaper.linux.child_processes import check_command
     from chainshaper.planning.request import best_effort_cores
     from chainshaper.values.recording import refuse_existing
 

@@ -255,7 +255,7 @@ def check(
         if budget is not None:
             judged_of = budgets.check_budgets(paths, limits, report, scheduler)
         judged = [limit for of_recording in judged_of for limit in of_recording]
-        unread = {limit.recording for limit in judged if limit.what == budgets.EVENTS}
+        unread = {limit.recording for limit in judged if limit.figure == budgets.EVENTS}
         paths = [path for path in paths if str(path) not in unread]
         if before and paths:
             from chainshaper.verify.slowdowns import slowdowns_in
@@ -269,12 +269,7 @@ def check(
     if markdown is not None:
         write_whole(markdown, [_markdown(judged, compared).encode()])
     if json:
-        rows = [
-            asdict(checked)
-            | {name: getattr(checked, name) for name in ("where", "what", "met", "text")}
-            for checked in every
-        ]
-        out.print_json({"format": JSON_FORMAT, "limits": rows})
+        out.print_json({"format": JSON_FORMAT, "limits": [_json_of(checked) for checked in every]})
     else:
         _show_checked(judged_of, compared, budget)
     verdicts = []
@@ -284,6 +279,18 @@ def check(
         verdicts.append(f"{slower} of {len(compared)} callbacks are slower than before")
     if verdicts:
         raise OperationError("; ".join(verdicts))
+
+
+def _json_of(checked: "Judged | Compared") -> dict[str, object]:
+    """Return a limit or a callback with the names that its values have in JSON."""
+    names = {"figure": "what", "measured": "found"}
+    values = {names.get(name, name): value for name, value in asdict(checked).items()}
+    return values | {
+        "where": checked.where,
+        "what": checked.figure,
+        "met": checked.met,
+        "text": checked.text,
+    }
 
 
 def _markdown(judged: "Sequence[Judged]", compared: "Sequence[Compared]") -> str:

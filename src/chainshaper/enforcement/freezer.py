@@ -36,7 +36,7 @@ from chainshaper.enforcement.servers import (
     server_named,
 )
 from chainshaper.linux import cgroups
-from chainshaper.linux.own_processes import end_in_words, start_module
+from chainshaper.linux.child_processes import end_in_words, start_module
 from chainshaper.linux.threads import has_ended, living_processes, start_of
 from chainshaper.values.errors import OperationError, PlatformError
 

@@ -35,7 +35,7 @@ from chainshaper.enforcement.journal import (
 )
 from chainshaper.enforcement.undoing import claim_run, strange_lines, undo_run
 from chainshaper.linux import cgroups
-from chainshaper.linux.own_processes import start_module, what_happened
+from chainshaper.linux.child_processes import start_module, what_happened
 from chainshaper.linux.scheduling import become_fifo, set_thread_name
 from chainshaper.linux.threads import open_process
 from chainshaper.values.errors import OperationError

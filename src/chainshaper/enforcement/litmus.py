@@ -28,7 +28,7 @@ from typing import Any
 from chainshaper.enforcement.journal import Journal
 from chainshaper.enforcement.scheduling_memory import note_scheduling, release_threads
 from chainshaper.enforcement.servers import BackEnd, ReservationServer, ServerTable, server_named
-from chainshaper.linux.own_processes import is_installed, tool_environment
+from chainshaper.linux.child_processes import is_installed, tool_environment
 from chainshaper.linux.scheduling import SchedulingClass, SchedulingRequest, apply_scheduling
 from chainshaper.linux.threads import find_thread, read_proc
 from chainshaper.values.durations import duration_text

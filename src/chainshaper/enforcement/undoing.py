@@ -45,7 +45,7 @@ from chainshaper.enforcement.scheduling_memory import (
     release_threads,
 )
 from chainshaper.enforcement.servers import ReservationServer, ServerCounters
-from chainshaper.linux import cgroups, own_processes
+from chainshaper.linux import cgroups, child_processes
 from chainshaper.linux.scheduling import state_of
 from chainshaper.linux.threads import find_thread, open_process
 from chainshaper.values.durations import duration_text
@@ -283,7 +283,7 @@ def end_run(journal: Journal) -> tuple[str, ...]:
 def _wait_for_end(journal: Journal) -> bool:
     """Wait until a run has ended; return whether it has in time."""
     # The owner first ends the run's command, which would run on if the owner were killed.
-    deadline = time.monotonic() + PATIENCE_S + 4 * own_processes.PATIENCE_S
+    deadline = time.monotonic() + PATIENCE_S + 4 * child_processes.PATIENCE_S
     while journal.path.exists() and journal.owner is not None:
         if time.monotonic() > deadline:
             return False

@@ -49,7 +49,7 @@ from chainshaper.flow.plan_in_force.threads import (
 )
 from chainshaper.flow.recorded_processes import evidence_of, recorded_in
 from chainshaper.flow.server_tables import server_table
-from chainshaper.linux.own_processes import end_command, start_command
+from chainshaper.linux.child_processes import end_command, start_command
 from chainshaper.linux.processes import run_users
 from chainshaper.linux.scheduling import check_cores
 from chainshaper.planning.offsets import LEAD_NS, chain_name

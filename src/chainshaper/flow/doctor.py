@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from chainshaper.enforcement.back_ends import offered_back_ends
-from chainshaper.linux.own_processes import tool_environment
+from chainshaper.linux.child_processes import tool_environment
 from chainshaper.linux.scheduling import available_cores, may_use_fifo, throttle_fraction
 from chainshaper.linux.threads import foreign_realtime_processes
 from chainshaper.values.errors import text_of

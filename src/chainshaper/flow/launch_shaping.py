@@ -28,7 +28,12 @@ from chainshaper.flow.apply import START_NS, apply_plan
 from chainshaper.flow.exploration import list_chains
 from chainshaper.flow.launch_splicing import Splicing, ThrottledInput
 from chainshaper.flow.plan import profile_chains
-from chainshaper.flow.profiling import chain_nodes, profiled_cores, profiling_condition, undelayed
+from chainshaper.flow.profiling_condition import (
+    chain_nodes,
+    profiled_cores,
+    profiling_condition,
+    undelayed,
+)
 from chainshaper.flow.record import Scheduling, record_command
 from chainshaper.linux.processes import RunningProcess, run_users
 from chainshaper.linux.scheduling import check_cores, may_use_fifo

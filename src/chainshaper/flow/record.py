@@ -26,7 +26,12 @@ from chainshaper.enforcement.node_threads import allocate, strangers_text
 from chainshaper.flow.exploration import with_trace_events
 from chainshaper.flow.recorded_processes import recorded_processes
 from chainshaper.linux import processes as running
-from chainshaper.linux.own_processes import check_command, end_command, end_in_words, start_command
+from chainshaper.linux.child_processes import (
+    check_command,
+    end_command,
+    end_in_words,
+    start_command,
+)
 from chainshaper.linux.processes import RunningProcess, find_applications
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import parents

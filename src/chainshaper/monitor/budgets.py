@@ -115,29 +115,29 @@ class Judged:
 
     recording: str
     where: str  # the chain, or the callback
-    what: str  # the figure that is limited, such as "maximum"
+    figure: str  # the name of what is limited, such as "maximum"
     limit: float
-    found: float | None  # the figure; None: nothing was measured, which breaks the limit
+    measured: float | None  # None: nothing was measured, which breaks the limit
     undisturbed: float | None = None  # of cycles that the machine did not disturb; None: unknown
     because: str | None = None  # where a broken limit comes from, or why nothing was measured
 
     @property
     def met(self) -> bool:
-        return self.found is not None and self.found <= self.limit
+        return self.measured is not None and self.measured <= self.limit
 
     @property
     def text(self) -> str:
-        """In one line: ``/t1../t5: maximum 81.2ms, budget 80ms (only in disturbed cycles)``."""
-        if self.found is None:
-            return f"{self.where}: {self.what} could not be measured; {self.because}"
-        found, limit = self._value(self.found), self._value(self.limit)
-        line = f"{self.where}: {self.what} {found}, budget {limit}"
+        """The limit in one line: ``/t1../t5: maximum 81.2ms, budget 80ms; from …``."""
+        if self.measured is None:
+            return f"{self.where}: {self.figure} could not be measured; {self.because}"
+        measured, limit = self._value(self.measured), self._value(self.limit)
+        line = f"{self.where}: {self.figure} {measured}, budget {limit}"
         if not self.met and self.undisturbed is not None and self.undisturbed <= self.limit:
             line += f", {self._value(self.undisturbed)} where the machine disturbed nothing"
         return line if self.because is None else f"{line}; {self.because}"
 
     def _value(self, value: float) -> str:
-        return f"{value:.2%}" if self.what == "missing" else duration_text(round(value))
+        return f"{value:.2%}" if self.figure == "missing" else duration_text(round(value))
 
 
 def load_budget(path: str | Path) -> Budget:
@@ -174,9 +174,11 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
         refuse_contradicted(flow.contradictions, analysis.chain.callbacks, recording.path)
         figures = analysis.statistics
         wanted: tuple[Percentile, ...] = ("50", "99")
-        percentiles = {which: limit(figures.percentiles_ns.get(which)) for which in wanted}
+        percentiles = {
+            percentile: limit(figures.percentiles_ns.get(percentile)) for percentile in wanted
+        }
         hops = tuple(
-            HopBudget(topic=topic, **{f"{part}_ns": limit(most) for part, most in parts.items()})
+            HopBudget(topic=topic, **{f"{part}_ns": limit(ns) for part, ns in parts.items()})
             for topic, parts in _longest_parts(hop_breakdown(analysis)).items()
         )
         missing = outputs_due(analysis).share or 0.0
@@ -184,7 +186,7 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
             ChainBudget(
                 chain=chain,
                 maximum_ns=limit(figures.max_ns),
-                percentiles={which: ns for which, ns in percentiles.items() if ns},
+                percentiles={percentile: ns for percentile, ns in percentiles.items() if ns},
                 jitter_ns=limit(figures.jitter_ns),
                 missing=min(1.0, max(LEAST_MISSING, round(missing * (1 + room), 4))),
                 hops=hops,
@@ -210,17 +212,19 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
         try:
             analysis = measure_latency(recording, chain.chain, flow=flow).analysis
         except InputError as error:
-            for what, limit, figure in _chain_limits(chain, None, None):
-                judged.append(Judged(name, chain.chain, what, limit, figure, because=str(error)))
+            for figure, limit, measured in _chain_limits(chain, None, None):
+                judged.append(
+                    Judged(name, chain.chain, figure, limit, measured, because=str(error))
+                )
             continue
         parts = hop_breakdown(analysis)
         hops = list(_judged_hops(name, chain, _longest_parts(parts)))
         because = _from_where(hops, parts) or "no cycle was complete"
-        calm = undisturbed_outputs_due(analysis).share
+        missing_undisturbed = undisturbed_outputs_due(analysis).share
         every = _chain_limits(chain, analysis.statistics, outputs_due(analysis).share)
-        undisturbed = _chain_limits(chain, analysis.undisturbed, calm)
-        for (what, limit, figure), (_, _, calm_figure) in zip(every, undisturbed, strict=True):
-            verdict = Judged(name, chain.chain, what, limit, figure, calm_figure)
+        undisturbed = _chain_limits(chain, analysis.undisturbed, missing_undisturbed)
+        for (figure, limit, measured), (_, _, calm) in zip(every, undisturbed, strict=True):
+            verdict = Judged(name, chain.chain, figure, limit, measured, calm)
             judged.append(verdict if verdict.met else replace(verdict, because=because))
         judged += hops
     return [*judged, *_judged_callbacks(name, budget.callbacks, longest_times(flow))]
@@ -253,7 +257,7 @@ def _checked(
 
 
 def broken_limits(budget: Budget, seen: "Seen") -> list[Judged]:
-    """The limits of a budget that the last minute broke.
+    """Return the limits of a budget that the last minute broke.
 
     A chain or callback that has never run breaks none. Of a chain that has run before, and had no
     output in the last minute, all outputs are missing.
@@ -273,9 +277,9 @@ def broken_limits(budget: Budget, seen: "Seen") -> list[Judged]:
             chain = chain.model_copy(update={"missing": None})  # noqa: PLW2901
         missing = OutputsDue.of(minute.count, minute.late, minute.incomplete).share
         if missing is not None:
-            why = None if minute.count else "no cycle was complete"
-            for what, limit, figure in _chain_limits(chain, minute, missing):
-                judged.append(Judged("now", chain.chain, what, limit, figure, because=why))
+            reason = None if minute.count else "no cycle was complete"
+            for figure, limit, measured in _chain_limits(chain, minute, missing):
+                judged.append(Judged("now", chain.chain, figure, limit, measured, because=reason))
             longest = {hop.topic: dict(zip(PARTS, hop.longest_ns, strict=True)) for hop in now.hops}
             judged += _judged_hops("now", chain, longest)
     times = {(callback.node, callback.starts): callback.longest_ns for callback in seen.callbacks}
@@ -308,8 +312,8 @@ def _chain_limits(
     statistics = figures or latency_statistics([])
     if chain.maximum_ns is not None:
         yield "maximum", chain.maximum_ns, statistics.max_ns
-    for which, limit in chain.percentiles.items():
-        yield f"p{which}", limit, statistics.percentiles_ns.get(which)
+    for percentile, limit in chain.percentiles.items():
+        yield f"p{percentile}", limit, statistics.percentiles_ns.get(percentile)
     if chain.jitter_ns is not None:
         yield "jitter", chain.jitter_ns, statistics.jitter_ns
     if chain.missing is not None:
@@ -317,9 +321,9 @@ def _chain_limits(
 
 
 def _longest_parts(parts: pl.DataFrame) -> dict[str, dict[str, float | None]]:
-    """The longest communication, computation and waiting of each hop, by its topic."""
-    most = (pl.col(f"{part}_ns").struct.field("max").alias(part) for part in PARTS)
-    rows = parts.select("topic", *most).iter_rows(named=True)
+    """Return the longest communication, computation and waiting of each hop, by its topic."""
+    longest = (pl.col(f"{part}_ns").struct.field("max").alias(part) for part in PARTS)
+    rows = parts.select("topic", *longest).iter_rows(named=True)
     return {row["topic"]: {part: row[part] for part in PARTS} for row in rows}
 
 
@@ -343,11 +347,11 @@ def _judged_callbacks(
         limits = {"response": callback.response_ns, "execution": callback.execution_ns}
         if measured is None:
             where, times = f"{callback.node} ({callback.starts})", None
-            why = "the recording has no such callback"
+            reason = "the recording has no such callback"
         else:
             where, times = f"{callback.node} ({measured.shown})", measured.times
-            why = "the recording has no such time"
-        yield from _judged(name, where, limits, times, why)
+            reason = "the recording has no such time"
+        yield from _judged(name, where, limits, times, reason)
 
 
 def _judged(
@@ -355,22 +359,24 @@ def _judged(
     where: str,
     limits: Mapping[str, int | None],
     times: Sequence[float | None] | None,
-    why: str,
+    reason: str,
 ) -> Iterator[Judged]:
     """Judge the limits that are given (not None) by the times, in the same order.
 
-    ``times`` is None where nothing was measured; ``why`` says why a time is not known.
+    ``times`` is None where nothing was measured; ``reason`` says why a time is not known.
     """
-    for (what, limit), most in zip(limits.items(), times or [None] * len(limits), strict=True):
+    longest = times or [None] * len(limits)
+    for (figure, limit), measured in zip(limits.items(), longest, strict=True):
         if limit is not None:
-            yield Judged(name, where, what, limit, most, because=why if most is None else None)
+            because = reason if measured is None else None
+            yield Judged(name, where, figure, limit, measured, because=because)
 
 
 def _from_where(hops: Sequence[Judged], parts: pl.DataFrame) -> str | None:
     """Name the hop that exceeds its budget by most; without one, that with the longest mean."""
-    broken = [verdict for verdict in hops if verdict.found is not None and not verdict.met]
+    broken = [verdict for verdict in hops if verdict.measured is not None and not verdict.met]
     if broken:
-        worst = max(broken, key=lambda verdict: (verdict.found or 0) - verdict.limit)
+        worst = max(broken, key=lambda verdict: (verdict.measured or 0) - verdict.limit)
         return f"from {worst.text.partition(': ')[2]}"
     if not parts["count"].sum():
         return None
@@ -386,7 +392,7 @@ def _from_where(hops: Sequence[Judged], parts: pl.DataFrame) -> str | None:
 
 
 def junit_report(judged: "Sequence[Judged | Compared]") -> str:
-    """JUnit XML: a suite for each recording, a test case for each limit or callback."""
+    """Return JUnit XML: a suite for each recording, a test case for each limit or callback."""
     root = ElementTree.Element("testsuites", name="chainshaper check")
     for recording in dict.fromkeys(verdict.recording for verdict in judged):
         of_recording = [verdict for verdict in judged if verdict.recording == recording]
@@ -394,7 +400,7 @@ def junit_report(judged: "Sequence[Judged | Compared]") -> str:
         counts = {"tests": str(len(of_recording)), "failures": str(broken)}
         suite = ElementTree.SubElement(root, "testsuite", {"name": shown(recording), **counts})
         for verdict in of_recording:
-            named = {"classname": shown(verdict.where), "name": shown(verdict.what)}
+            named = {"classname": shown(verdict.where), "name": shown(verdict.figure)}
             case = ElementTree.SubElement(suite, "testcase", named)
             if not verdict.met:
                 ElementTree.SubElement(case, "failure", {"message": shown(verdict.text)})
@@ -405,7 +411,7 @@ def junit_report(judged: "Sequence[Judged | Compared]") -> str:
 def markdown_report(
     judged: "Sequence[Judged | Compared]", words: tuple[str, str, str] = ("limits", "broken", "met")
 ) -> str:
-    """GitHub-flavoured Markdown for a pull request: what breaks, and how many limits are met.
+    """Return Markdown (GitHub's) for a pull request: what breaks, and how many limits are met.
 
     ``words`` are for what is judged, and for both verdicts.
     """

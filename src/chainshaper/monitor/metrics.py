@@ -109,12 +109,12 @@ def delivery_news(exporter: Any, endpoint: str) -> Callable[[], list[str]]:
         result = export(*arguments, **options)
         if arrives is not (result.name == "SUCCESS"):
             arrives = not arrives
-            why = reasons[0].strip() if reasons else "it does not say why"
+            reason = reasons[0].strip() if reasons else "it does not say why"
             if arrives:
                 news.append(f"metrics arrive at {endpoint} again")
             else:
                 retry = "it is tried every ten seconds"
-                news.append(f"metrics do not arrive at {endpoint} ({why}): {retry}")
+                news.append(f"metrics do not arrive at {endpoint} ({reason}): {retry}")
         return result
 
     exporter.export = exported

@@ -143,9 +143,10 @@ class Seen:
         return asdict(self)
 
     def as_diagnostics(self) -> list[dict[str, Any]]:
-        """A status for each chain, for :func:`~chainshaper.sources.ros.publishing_diagnostics`.
+        """Return a status for each chain, as `/diagnostics` has it.
 
-        ERROR: nothing was to be seen in the last minute. WARN: an output was late or never came.
+        ERROR: there was no output in the last minute. WARN: an output was late or never came. They
+        are for :func:`~chainshaper.sources.ros.publishing_diagnostics`.
         """
         statuses = []
         for chain in self.chains:
@@ -158,16 +159,16 @@ class Seen:
             values = {"cycles per second": f"{chain.rate_hz:.3f}"}
             for span, figures in chain.spans.items():
                 shown = (("p50", figures.percentiles_ns.get("50")), ("max", figures.max_ns))
-                for which, ns in shown:
+                for statistic, ns in shown:
                     if ns is not None:
-                        values[f"{which} of the last {span} [ms]"] = f"{ns / 1e6:.3f}"
+                        values[f"{statistic} of the last {span} [ms]"] = f"{ns / 1e6:.3f}"
             about = {"name": f"chainshaper: {chain.chain}", "level": level, "message": text}
             statuses.append({**about, "values": values})
         return statuses
 
 
 _SAME = ("node", "kind", "topic", "declared_ns")
-"""A callback with the same is the same one, although its node was started again."""
+"""Two callbacks that agree in these are one callback, whose node was started again."""
 _CYCLE = pl.Schema(
     {"start": pl.Int64, "latency_ns": pl.Int64, "late": pl.Boolean, "place_ns": pl.Int64}
 )
@@ -220,21 +221,22 @@ class _Chain:
             self.hops.append((now_ns, figures))
 
     def statistics(self, since_ns: int) -> LatencyStatistics:
-        """Statistics over the cycles that began since an instant."""
+        """Return statistics over the cycles that began since an instant."""
         begun = self.cycles.filter(pl.col("start") >= since_ns)
         whole = begun.drop_nulls("latency_ns")
         late = None if whole["late"].null_count() else int(whole["late"].sum())
-        gone = begun.height - whole.height
-        return latency_statistics(whole["latency_ns"].to_numpy(), incomplete=gone, late=late)
+        return latency_statistics(
+            whole["latency_ns"].to_numpy(), incomplete=begun.height - whole.height, late=late
+        )
 
     def worst_ns(self, since_ns: int) -> tuple[int, ...]:
-        """The start of the worst cycle since an instant: without an output, or the longest."""
+        """Return the start of the worst cycle since an instant: without output, or the longest."""
         rows = self.cycles.filter(pl.col("start") >= since_ns)
         worst = rows.sort("latency_ns", descending=True, nulls_last=False, maintain_order=True)
         return tuple(worst["start"].head(1))
 
     def shares(self) -> tuple[tuple[float, ...], float]:
-        """The share of outputs within each slot, and that of those before the first one."""
+        """Return the share of outputs within each slot, and that of those before the first one."""
         places = self.cycles.drop_nulls("latency_ns")["place_ns"].drop_nulls().to_numpy()
         if not self.slots or not places.size:
             return (), 0.0
@@ -245,7 +247,7 @@ class _Chain:
         return tuple((counted / places.size).tolist()), float((slots < 0).mean())
 
     def beginning(self, graph: ApplicationGraph) -> Chain | None:
-        """The first callback as a chain, where the whole one was found once and is no longer."""
+        """Return the first callback as a chain, where the whole chain is no longer there."""
         if self.first is None:
             return None
         topic = self.names[0][1]
@@ -290,16 +292,15 @@ class Watch:
         ends = [(text, text.rpartition("..")[2]) for text in chains]
         self.chains = [_Chain(text, end, self._slots(end)) for text, end in ends]
         self.processes: dict[int, TracedProcess] = {}
-        self._left_out: dict[
-            int, str
-        ] = {}  # by pid, a sentence that says why nothing is seen of it
+        # By pid, a sentence that says why nothing is seen of it.
+        self._left_out: dict[int, str] = {}
         self._created: dict[int, tuple[int, dict[str, pl.DataFrame], TracingLibrary]] = {}
         self._fresh: list[tuple[int, NDArray[Any]]] = []  # pid and records, not yet in a table
         self._recent: deque[tuple[int, dict[str, pl.DataFrame]]] = deque()  # last instant, events
         self._latest: dict[int, int] = {}  # by pid, the time of its last event
         self._tabled_ns = 0
         self._stepped_ns = 0  # when CLOCK_REALTIME was set: cycles from before are unclear
-        self._known: list[tuple[Any, ...]] = []
+        self._basis: list[tuple[Any, ...]] = []  # of the objects below: see `_objects`
         self._resolved = resolve_objects({})
         self._clock_offset_ns = clock_offset()
         self._searched_ns = 0
@@ -312,7 +313,7 @@ class Watch:
         return next((due for due in self.due if due.output in (None, output)), None)
 
     def _plan_of(self, output: str) -> ChainPlan | None:
-        """The plan whose promise is about a chain with this output."""
+        """Return the plan whose promise is about a chain with this output."""
         plans = () if self.plan is None else self.plan.chains
         return next((plan for plan in plans if plan.chain.output in (None, output)), None)
 
@@ -330,8 +331,8 @@ class Watch:
             self._left_out = {
                 pid: reason for pid, reason in self._left_out.items() if _is_running(pid)
             }
-            known = {*self.processes, *self._left_out}
-            for pid, memory in memories(self.users, known, self._left_out.__setitem__):
+            followed = {*self.processes, *self._left_out}
+            for pid, memory in memories(self.users, followed, self._left_out.__setitem__):
                 self.processes[pid], self._latest[pid] = memory, 0
                 created, _ = memory.objects()
                 if created.size and created["time"][0] < self._began_ns:
@@ -418,7 +419,7 @@ class Watch:
     def _judged(
         self, watched: _Chain, flow: DataFlow, graph: ApplicationGraph
     ) -> tuple[pl.DataFrame, pl.DataFrame] | None:
-        """The traversals of a chain, late ones marked, and their hops; None: it is in no graph.
+        """Return the judged traversals of a chain, and their hops; None: the chain is not there.
 
         Where only its beginning is in the graph, each cycle that began is incomplete.
         """
@@ -448,23 +449,23 @@ class Watch:
         return judged, traversals.hops
 
     def _objects(self, tables: EventTables, since_ns: int) -> Objects:
-        """The objects of all processes: those of the last look, if none can have come since.
+        """Return the objects of all processes: those of the last look, if none can have come since.
 
         To resolve them is half of the work of a look. Objects of Python nodes become known only
         when a callback runs or a subscription takes, so these are compared, too.
         """
-        what_ran = [("callback_start", "callback"), ("rmw_take", "rmw_subscription_handle")]
-        known = [tuple(sorted((pid, created[0]) for pid, created in self._created.items()))]
-        for name, column in what_ran:
+        columns_of_runs = [("callback_start", "callback"), ("rmw_take", "rmw_subscription_handle")]
+        basis = [tuple(sorted((pid, created[0]) for pid, created in self._created.items()))]
+        for name, column in columns_of_runs:
             rows = events.table(tables, name).select("pid", column).unique()
-            known.append(tuple(sorted(rows.iter_rows())))
+            basis.append(tuple(sorted(rows.iter_rows())))
         times = (tables[name]["time"][-1] for name in events.CREATION & tables.keys())
-        if known != self._known or max(times, default=0) >= since_ns:
-            self._known, self._resolved = known, resolve_objects(tables)
+        if basis != self._basis or max(times, default=0) >= since_ns:
+            self._basis, self._resolved = basis, resolve_objects(tables)
         return self._resolved
 
     def _now(self, chain: _Chain, over_ns: int, moved: Mapping[str, int]) -> ChainNow:
-        """The figures of a chain whose cycles until ``over_ns`` are counted."""
+        """Return the figures of a chain whose cycles until ``over_ns`` are counted."""
         moved_ns = moved.get(chain.output, 0)
         begun = chain.cycles["start"].filter(chain.cycles["start"] > over_ns - SPANS["minute"])
         shares, early = chain.shares()
@@ -494,10 +495,10 @@ class Watch:
         return running + self._lost_with_ended
 
     def _tables(self, since_ns: int) -> EventTables:
-        """Events since an instant, and the creation of all objects but those of ended processes."""
+        """Return events since an instant, and the creation of objects, without ended processes'."""
         self._take_fresh(time.monotonic_ns())
-        gone = {pid for pid in self._ended() if self._latest[pid] < since_ns}
-        created = (tables for pid, (_, tables, _) in self._created.items() if pid not in gone)
+        silent = {pid for pid in self._ended() if self._latest[pid] < since_ns}
+        created = (tables for pid, (_, tables, _) in self._created.items() if pid not in silent)
         recent = (tables for last_ns, tables in self._recent if last_ns >= since_ns)
         return joined_tables([*created, *recent])
 
@@ -614,10 +615,10 @@ def exporting(
         until.callback(provider.shutdown, timeout_millis=LONGEST_END_MS)
         meter, last = provider.get_meter("chainshaper"), list[Seen]()
 
-        def observed(wanted: str, _options: object) -> Iterator[Any]:
+        def observed(metric: str, _options: object) -> Iterator[Any]:
             for seen in last:
                 for name, value, about in _values(seen):
-                    if name == wanted:
+                    if name == metric:
                         yield observation(value, about)
 
         for name, (kind, unit, about) in _METRICS.items():
@@ -646,10 +647,13 @@ def _values(seen: Seen) -> Iterator[tuple[str, float, dict[str, str]]]:
     for chain in seen.chains:
         named = {"chain": chain.chain}
         for span, figures in chain.spans.items():
-            percentiles = {f"p{which}": ns for which, ns in figures.percentiles_ns.items()}
-            for which, ns in {"min": figures.min_ns, "max": figures.max_ns, **percentiles}.items():
-                if ns is not None:
-                    yield "chain.latency", ns / SECOND, {**named, "span": span, "statistic": which}
+            statistics: dict[str, int | None] = {"min": figures.min_ns, "max": figures.max_ns}
+            for percentile, reached_ns in figures.percentiles_ns.items():
+                statistics[f"p{percentile}"] = reached_ns
+            for statistic, figure_ns in statistics.items():
+                if figure_ns is not None:
+                    about = {**named, "span": span, "statistic": statistic}
+                    yield "chain.latency", figure_ns / SECOND, about
         for hop in chain.hops:
             about = {**named, "node": hop.node, "topic": hop.topic}
             for part in PARTS:

@@ -52,7 +52,11 @@ def given_or_least_epsilon_ns(wishes: Wishes) -> int:
 
 
 def allowed_late_share(margin: Margin) -> float:
-    """Return the share of outputs that may be late by a plan's margin, or by default."""
+    """Return the share of outputs that may be late under a plan with this margin.
+
+    A margin that says nothing about it, as one in a plan that was written by hand, allows the
+    default share. Verdicts and `apply --adapt` both go by this.
+    """
     return margin.overrun_probability or OVERRUN_PROBABILITY
 
 

@@ -23,7 +23,7 @@ from chainshaper.planning.chain_plan import (
     Thread,
 )
 from chainshaper.planning.late_shares import cycles_needed
-from chainshaper.planning.margins import OVERRUN_PROBABILITY
+from chainshaper.planning.margins import OVERRUN_PROBABILITY, allowed_late_share
 from chainshaper.values.durations import duration_text, milliseconds
 from chainshaper.values.errors import InputError
 
@@ -457,7 +457,7 @@ def _about_late_outputs(plan: ChainPlan) -> Iterator[str]:
         text = f"covering the disturbed cycles costs {milliseconds(margin.stalls_ns)} ms: outputs"
         text += f" leave at {milliseconds(end)} ms; on a machine that does not stall it would be"
         yield f"{text} {milliseconds(end - margin.stalls_ns)} ms (--ideal-machine)."
-    late = margin.overrun_probability or 0.0
+    late = allowed_late_share(margin)
     if cycles >= needed and late > OVERRUN_PROBABILITY and margin.source != "derived":
         text = f"by the latencies of all cycles, up to {late:.1%} of the outputs will miss their"
         yield f"{text} slot ({plan.overrun}): a larger margin (--epsilon) or calmer machine helps."

@@ -306,9 +306,9 @@ def deciding_cycles(profile: Profile) -> str | None:
 class Rival(NamedTuple):
     """Something that runs before a chain on its cores (T, C and J above)."""
 
-    period_ns: int  # so often it runs
-    cost_ns: int  # so long, at most
-    jitter_ns: int = 0  # so much later in one cycle than in another, at most
+    period_ns: int  # from one run to the next
+    cost_ns: int  # of a run, at most
+    jitter_ns: int = 0  # how much later it comes in one cycle than in another, at most
 
 
 def interference(alone_ns: int, rivals: Sequence[Rival], limit_ns: int) -> int:
@@ -356,7 +356,9 @@ def with_interference(
     delays = [0] * len(profiles)
     for _ in range(MOST_ROUNDS):
         before = delays
-        delays = _delays(undelayed, groups, wishes, before, (at_once, shifting))
+        delays = _delays(
+            undelayed, groups, wishes, before_ns=before, at_once=at_once, shifting=shifting
+        )
         if delays == before:
             break
     measured = (profile.latencies_ns for profile in profiles)
@@ -372,7 +374,7 @@ def _of_gates_beside(place: int, profiles: Sequence[Profile], wishes: Wishes) ->
         (1 + -(-profile.period_ns // rival.period_ns)) * rival.cost_ns
         for place_beside, beside in enumerate(profiles)
         if place_beside != place and beside.core_of.get(beside.last or "") in cores
-        for rival in _of_gate(beside, wishes, 0, False)
+        for rival in _of_gate(beside, wishes, 0, shifting=False)
     )
 
 
@@ -380,14 +382,15 @@ def _delays(
     profiles: Sequence[Profile],
     groups: Sequence[Sequence[int]],
     wishes: Wishes,
+    *,
     before_ns: Sequence[int],
-    together: tuple[bool, bool],
+    at_once: bool,
+    shifting: bool,
 ) -> list[int]:
-    """Return how long each chain may be delayed, where the others come up to ``before_ns`` later.
+    """Return how long each chain may be delayed (ns), as :func:`with_interference` has it.
 
-    ``together``: whether groups run at once, and whether their stamps shift.
+    ``before_ns`` has how much later each chain comes by what is known so far.
     """
-    at_once, shifting = together
     delays, better = [0] * len(profiles), list[Sequence[int]]()
     gates = wishes.policy not in UNSHAPED and wishes.publication != "asynchronous"
     for group in sorted(groups, key=lambda places: (profiles[places[0]].period_ns, places[0])):
@@ -409,14 +412,14 @@ def _delays(
                 cores = _cores(profile, forked if place_beside in group else _stages([profile]))
                 is_beside = place_beside != place and beside.core_of.get(beside.last or "") in cores
                 if gates and is_beside:
-                    rivals += _of_gate(beside, wishes, before_ns[place_beside], shifting)
+                    rivals += _of_gate(beside, wishes, before_ns[place_beside], shifting=shifting)
                     rivals += _of_receivers(beside, profiles, before_ns[place_beside])
             delays[place] = interference(_longest_in_time(profile), rivals, profile.period_ns)
         better.append(group)
     return delays
 
 
-def _of_gate(profile: Profile, wishes: Wishes, delay_ns: int, shifting: bool) -> Iterator[Rival]:
+def _of_gate(profile: Profile, wishes: Wishes, delay_ns: int, *, shifting: bool) -> Iterator[Rival]:
     """Yield how long the gate of a chain has its core: when a message comes, and when it leaves.
 
     The chain may be delayed by ``delay_ns``.

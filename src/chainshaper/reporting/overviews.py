@@ -605,9 +605,9 @@ def broken_table(broken: "Sequence[Judged]") -> ResultTable:
     columns = [*words("recording", "where", "limit"), *figures("budget", "found")]
     table = ResultTable("Limits that are broken", [*columns, *words("because")])
     for judged in broken:
-        shown = percent if judged.what == "missing" else ms
-        values = shown(judged.limit), shown(judged.found)
-        table.add(judged.recording, judged.where, judged.what, *values, judged.because or "")
+        shown = percent if judged.figure == "missing" else ms
+        values = shown(judged.limit), shown(judged.measured)
+        table.add(judged.recording, judged.where, judged.figure, *values, judged.because or "")
     return table
 
 

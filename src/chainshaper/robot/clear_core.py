@@ -56,10 +56,10 @@ class ClearCore:
         self._process, self._times = started_beside(_clear, core)
         self.pid = self._process.pid
 
-    def clear_until(self, time_ns: int) -> None:
+    def clear_until(self, until_ns: int) -> None:
         """Keep the core clear from now until this time (ns of CLOCK_MONOTONIC)."""
         with suppress(BrokenPipeError):
-            os.write(self._times, time_ns.to_bytes(8, "little"))
+            os.write(self._times, until_ns.to_bytes(8, "little"))
 
     def end(self) -> None:
         """Give the core back."""

@@ -36,12 +36,12 @@ INTO_OPEN_SLOT, MESSAGES = get_args(IntoOpenSlot), get_args(Messages)
 
 DEPTH = 10  # messages that may wait at a gate by default
 MAX_FUTURE_NS = 1_000_000  # a stamp further ahead of the arrival is of no use
-MAX_AGE_CYCLES = 10  # nor is one older than this, behind the message's due cycle
+MAX_AGE_CYCLES = 10  # neither is a stamp older than this, behind the message's due cycle
 
 
-def _one_of(key: str, word: str, known: Sequence[str]) -> None:
-    if word not in known:
-        raise ValueError(f"{key} {word!r}: choose one of {', '.join(known)}")
+def _check_word(key: str, word: str, choices: Sequence[str]) -> None:
+    if word not in choices:
+        raise ValueError(f"{key} {word!r}: choose one of {', '.join(choices)}")
 
 
 @dataclass(frozen=True)
@@ -63,11 +63,11 @@ class GateModes:
         if self.default not in self.slots:
             choose = f"choose one of {', '.join(self.slots)}"
             raise ValueError(f"the default mode {self.default!r} has no band: {choose}")
-        _one_of("late", self.late, LATE)
+        _check_word("late", self.late, LATE)
 
 
 class AtLeast(NamedTuple):
-    """The smallest value of a number, and what is said of a smaller one."""
+    """The smallest value of a number, and the message about a smaller one."""
 
     number: int
     otherwise: str
@@ -124,7 +124,7 @@ class Gate:
         for declared in fields(self):
             value, limit = getattr(self, declared.name), limit_of(declared)
             if get_origin(declared.type) is Literal:
-                _one_of(declared.name, value, get_args(declared.type))
+                _check_word(declared.name, value, get_args(declared.type))
             if limit is not None and value < limit.number:
                 raise ValueError(limit.otherwise.format(value))
         if not self.slots:
@@ -137,8 +137,8 @@ class Gate:
             previous_end = end
         for mode, place in ({} if self.modes is None else self.modes.slots).items():
             if not 0 <= place < len(self.slots):
-                known = f"bands are numbered 1 to {len(self.slots)}"
-                raise ValueError(f"mode {mode!r}: band {place + 1}, but {known}")
+                bands = f"bands are numbered 1 to {len(self.slots)}"
+                raise ValueError(f"mode {mode!r}: band {place + 1}, but {bands}")
 
     def may_move(self, by_ns: int) -> bool:
         """Return whether slots that are moved by this time still lie within the cycle."""

@@ -76,7 +76,7 @@ RING = 1024
 RELEASED, BYPASSED, MEASURED = 32, 32 + RING, 32 + 2 * RING  # places of rings of numbers
 ASKED = 32 + 3 * RING  # place of the ring of changes that were asked for, of three numbers each:
 CHANGES = 64  # the room of that ring
-NEW_PHASE, NEW_MOVE = 0, 1  # what a change may be of
+NEW_PHASE, NEW_MOVE = 0, 1  # kinds of changes
 TOPIC = ASKED + 3 * CHANGES  # place of the output's name
 TOPIC_BYTES = 256
 PUBLISHING, STANDING_BY, PASSING, MOVING, ASKING = 0, 1, 2, 3, 4
@@ -148,13 +148,13 @@ class Change(NamedTuple):
     """A change of a gate's schedule that was asked for.
 
     * ``from_ns``: it is in force in cycles that start then or later (CLOCK_MONOTONIC).
-    * ``what``: :data:`NEW_PHASE`: where cycles start, or :data:`NEW_MOVE`: by how much slots are
+    * ``kind``: :data:`NEW_PHASE`: where cycles start, or :data:`NEW_MOVE`: by how much slots are
       moved from where the gate has them.
     * ``value``: that time (ns).
     """
 
     from_ns: int
-    what: int
+    kind: int
     value: int
 
 
@@ -274,7 +274,7 @@ class Page:
         """By how much another process has the slots moved."""
         if not self.is_locked(MOVING):
             return 0
-        moves = [change.value for change in self.asked() if change.what == NEW_MOVE]
+        moves = [change.value for change in self.asked() if change.kind == NEW_MOVE]
         return moves[-1] if moves else 0
 
     @property
@@ -353,12 +353,13 @@ class Turn:
                     page[count] = 0
         page["parent"] = parent
         self.page, self._in_force = page, False
-        # How many messages the standby had dealt with at the last look, and which.
+        # At the last look: how many messages the standby had dealt with (-1: no look yet), which,
+        # and the message before which it has dealt with all.
         self._seen, self._bypassed, self._oldest = -1, frozenset[int](), 0
-        # How many changes were asked for at the last look. A phase that was asked for before is
-        # that of another gate; a move is in force for as long as its process lives.
+        # How many changes had been asked for at the last look. A phase that was asked for before
+        # is that of another gate; a move is in force for as long as its process lives.
         self._asked = page["asked"]
-        self._moves_before = [change for change in page.asked() if change.what == NEW_MOVE]
+        self._moves_before = [change for change in page.asked() if change.kind == NEW_MOVE]
 
     @property
     def wait_s(self) -> float:
@@ -421,10 +422,11 @@ class Turn:
         return True
 
     def is_overtaken_by(self, key: int | None) -> bool:
-        """Return whether the standby has dealt with this message, which is behind the one in hand.
+        """Return whether the standby has dealt with this message, which waits behind the oldest.
 
-        The one in hand would come after it. The standby, which started later than this node, did
-        not receive the one in hand. To be called after :meth:`was_bypassed`.
+        The oldest message, which the node is about to publish, would come after it: the standby
+        started later than this node, and did not receive the oldest. To be called after
+        :meth:`was_bypassed`.
         """
         return key in self._bypassed
 
@@ -452,12 +454,12 @@ class Turn:
         if asked != self._asked:
             changes += self.page.asked(self._asked)
             self._asked = asked
-        self._has_moved = self._has_moved or any(change.what == NEW_MOVE for change in changes)
+        self._has_moved = self._has_moved or any(change.kind == NEW_MOVE for change in changes)
         is_following = self._has_moved and self.page.is_locked(MOVING)
-        for from_ns, what, value in changes:
-            if what == NEW_PHASE:
+        for from_ns, kind, value in changes:
+            if kind == NEW_PHASE:
                 queue.set_phase(value, from_ns)
-            elif what == NEW_MOVE and is_following:
+            elif kind == NEW_MOVE and is_following:
                 queue.move_slots(value, from_ns)
         if self._has_moved and not is_following:
             queue.move_slots(0, time.monotonic_ns())
@@ -518,7 +520,7 @@ class Standby:
         self._changed, self._patience_ns = changed, patience_ns
         self._pending: deque[Waiting] = deque(maxlen=depth)  # about: the source timestamp, or 0
         self._mutex = threading.Lock()
-        self._why = ""
+        self._reason = ""  # of the bypass that was reported last
         self._silent = silent
         self._woken, self._wake = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._open()
@@ -568,7 +570,7 @@ class Standby:
 
     def watch(self) -> None:
         """Look when the shaping node dies, and when it is late for a release; for ever."""
-        gone = 0  # a process that has ended can be opened until its parent waits for it
+        ended_pid = 0  # a process that has ended can be opened until its parent waits for it
         while True:
             with self._mutex:  # the page may be left meanwhile
                 self._forget()
@@ -579,7 +581,7 @@ class Standby:
             poll, died = select.poll(), -1
             poll.register(self._woken, select.POLLIN)
             with suppress(OSError):  # there is no such process
-                if holder not in (0, gone):
+                if holder not in (0, ended_pid):
                     died = os.pidfd_open(holder)
                     poll.register(died, select.POLLIN)
             ended = (died, select.POLLIN) in poll.poll(left_ms)
@@ -589,7 +591,7 @@ class Standby:
                 os.close(died)
             self.look()
             if ended:
-                gone = holder
+                ended_pid = holder
                 time.sleep(0.001)  # another node may have the lock and be about to write its name
 
     def _due_ns(self) -> int:
@@ -597,23 +599,24 @@ class Standby:
         return max(self.page["until_ns"], self._pending[0].arrival_ns) + self._patience_ns
 
     def _look(self, now: int) -> None:
+        """Publish the pending messages if no shaping node is in force, or if it hangs."""
         alone = self._none_in_force()
         self._forget()
         taken = self.page["taken"]
         if alone:
-            self._gone("is not there")
+            self._report_bypass("is not there")
             self._pass_on(len(self._pending))
             self.page.unlock()
         elif self._pending and (now > self._due_ns() or taken == self._stuck_at):
             self._stuck_at = taken
-            self._gone("is late for its own release: it hangs, or was stopped")
+            self._report_bypass("is late for its own release: it hangs, or was stopped")
             self.page.lock(PASSING)
             for waiting in self._pending:  # noted first: the node could go on at any time
                 self.page.add("bypassed", waiting.about)
             self._pass_on(len(self._pending), noted=True)
             self.page.unlock(PASSING)
         elif taken != self._stuck_at:
-            self._back()
+            self._report_return()
             # Messages before the first one of the node in force came to this process alone.
             first, keys = self.page["first"], [waiting.about for waiting in self._pending]
             if first != self.page["acknowledged"] and first in keys:
@@ -629,30 +632,33 @@ class Standby:
 
     def _forget(self) -> None:
         """Forget messages that were dealt with, and those before them: order must not break."""
-        known = {*self.page.noted("released"), *self.page.noted("bypassed")}
+        noted = {*self.page.noted("released"), *self.page.noted("bypassed")}
         dealt_with = [
-            count for count, waiting in enumerate(self._pending, 1) if waiting.about in known
+            count for count, waiting in enumerate(self._pending, 1) if waiting.about in noted
         ]
         for _ in range(max(dealt_with, default=0)):
             self._pending.popleft()
 
     def _pass_on(self, count: int, *, noted: bool = False) -> None:
+        """Publish the oldest pending messages; note them on the page, unless they are ``noted``."""
         for _ in range(count):
             waiting = self._pending.popleft()
             self._publish(waiting.payload, waiting.about or None, waiting.arrival_ns)
             if not noted:
                 self.page.add("bypassed", waiting.about)
 
-    def _gone(self, why: str) -> None:
+    def _report_bypass(self, reason: str) -> None:
+        """Say that messages go around the shaping node, once for each reason."""
         if not self.page["bypassing_since_ns"]:
             self.page["bypassed_before"] = self.page["bypassed"]
             self.page["bypassing_since_ns"] = time.monotonic_ns()
-            self._why = ""
-        if why != self._why:
-            self._changed(why)
-            self._why = why
+            self._reason = ""
+        if reason != self._reason:
+            self._changed(reason)
+            self._reason = reason
 
-    def _back(self) -> None:
+    def _report_return(self) -> None:
+        """Say that a shaping node is in force again, if none was."""
         if since := self.page["bypassing_since_ns"]:
             self.page["bypassing_since_ns"] = 0
             passed = self.page["bypassed"] - self.page["bypassed_before"]

@@ -37,20 +37,20 @@ ENUMERATIONS = {
 
 
 def schema_header(template: str) -> str:
-    """The text of `schema.hpp`: the text of `schema.hpp.in` with its places filled in."""
+    """Return the text of `schema.hpp`: that of `schema.hpp.in` with its places filled in."""
     values = _values()
     return re.sub("@([A-Z_]+)@", lambda place: values[place[1]], template)
 
 
 def constants(numbers: Mapping[str, int]) -> str:
-    """Numbers as constants in C++, a line each."""
+    """Return numbers as constants in C++, a line each."""
     return "\n".join(
         f"inline constexpr std::int64_t {name} = {value};" for name, value in numbers.items()
     )
 
 
 def numbers_of(module: ModuleType) -> dict[str, int]:
-    """The public constants of a module that are integers, by their names in C++."""
+    """Return the public constants of a module that are integers, by their names in C++."""
     return {
         name.lower(): value
         for name, value in vars(module).items()
@@ -59,7 +59,7 @@ def numbers_of(module: ModuleType) -> dict[str, int]:
 
 
 def _values() -> dict[str, str]:
-    """What stands in each place of the template."""
+    """Return the text for each place of the template."""
     numbers = numbers_of(handover) | {"log_columns": len(LOG_COLUMNS)}
     members = [
         f"{_CPP_TYPES[type_]} {name}{{{_in_cpp(default)}}};"
@@ -78,8 +78,10 @@ def _values() -> dict[str, str]:
 def enumeration_of(declared: "Field[Any]") -> str | None:
     """Return the type in C++ of a gate's value that is a word; None: it is a number."""
     words = get_args(declared.type)
-    kinds = (kind for kind, known in ENUMERATIONS.items() if words and known[: len(words)] == words)
-    return next(kinds, None)
+    if not words:
+        return None
+    types = (name for name, listed in ENUMERATIONS.items() if listed[: len(words)] == words)
+    return next(types, None)
 
 
 def gate_values() -> str:
@@ -116,5 +118,5 @@ def _in_cpp(value: str | int | list[Any]) -> str:
 
 
 if __name__ == "__main__":
-    made_from, made = map(Path, sys.argv[1:])
-    made.write_text(schema_header(made_from.read_text("utf-8")), "utf-8")
+    template, header = map(Path, sys.argv[1:])
+    header.write_text(schema_header(template.read_text("utf-8")), "utf-8")

@@ -26,7 +26,7 @@ class FirstOfPeriod:
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns, self._early_ns = period_ns, period_ns // EARLY_DIVISOR
-        self._due_ns = self._passed_ns = -2 * period_ns  # the first one passes
+        self._due_ns = self._passed_ns = -2 * period_ns  # the first message passes
 
     def passes(self, now_ns: int) -> bool:
         """Return whether a message that comes now passes."""

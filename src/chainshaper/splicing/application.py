@@ -32,7 +32,7 @@ from chainshaper.workload.description import (
 
 
 def splice_application(application: Application, plan: Plan) -> Application:
-    """Return the application as the plan has it run, with its shaping nodes and chains at offsets.
+    """Return the application as it runs under a plan, with shaping nodes and chains at offsets.
 
     Raises InputError: the plan shapes nothing, or does not fit the application.
     """
@@ -41,9 +41,10 @@ def splice_application(application: Application, plan: Plan) -> Application:
         application = _with_chain(application, chain)
     described = {*map(node_name, application.nodes)}
     planned = {thread.node for server in plan.servers for thread in server.threads}
-    if strange := planned - described - {node.thread.node for node in plan.shaping_nodes}:
+    unknown = planned - described - {node.thread.node for node in plan.shaping_nodes}
+    if unknown:
         raise InputError(
-            f"the plan names {', '.join(sorted(strange))}, which {application.name!r} does not have"
+            f"the plan names {', '.join(sorted(unknown))}, which {application.name!r} does not have"
             f" (its nodes: {', '.join(sorted(described))}): correct the plan, or plan from a"
             " recording of this application"
         )
@@ -161,17 +162,19 @@ def _spliced(application: Application, plan: ChainPlan, shaping: ShapingNode) ->
     publisher = nodes[publishers[0]]
     callbacks = []
     for callback in publisher.callbacks:
-        published = [shaping.input if t == shaping.output else t for t in callback.publishes]
-        callbacks.append(callback.model_copy(update={"publishes": tuple(published)}))
+        topics_published = [
+            shaping.input if topic == shaping.output else topic for topic in callback.publishes
+        ]
+        callbacks.append(callback.model_copy(update={"publishes": tuple(topics_published)}))
     nodes[publishers[0]] = publisher.model_copy(update={"callbacks": tuple(callbacks)})
     depth = shaping.depth or max(10, application.topic(shaping.output).depth)
     _, timer = origin_timer(application, plan.chain.spec)
     nodes[shaping.name] = _described(plan, shaping, depth, timer.phase_ns)
     if shaping.output in topics:
         topics[shaping.input] = topics[shaping.output]  # the same quality of service
-    first, arrow, others = application.chain.partition("..")
+    first, arrow, rest = application.chain.partition("..")
     starts = arrow and first.strip() == shaping.output  # the chain begins with the same message
-    chain = f"{shaping.input}..{others}" if starts else application.chain
+    chain = f"{shaping.input}..{rest}" if starts else application.chain
     return application.model_copy(update={"nodes": nodes, "topics": topics, "chain": chain})
 
 

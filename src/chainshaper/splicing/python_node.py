@@ -1,4 +1,4 @@
-"""The one file of a node in Python: the gate as it is, what it needs of ROS 2, and the node."""
+"""Put a node in Python into one file, behind the modules of `chainshaper.robot` it imports."""
 
 import ast
 from pathlib import Path
@@ -9,7 +9,7 @@ _SOURCES = Path(__file__).parents[2]
 
 
 def python_node(executable: str) -> str:
-    """Return the text of the one file of a node in Python."""
+    """Return the text of a node in Python as a single file."""
     parts: dict[Path, str] = {}
 
     def add(path: Path) -> None:

@@ -29,7 +29,8 @@ MOST_LOOKS = 10  # looks for publishers, a second apart, while discovery has not
 UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # of an endpoint that was discovered before its node was (rmw)
 
 _DRY_RUN = "chainshaper_dry_run"
-_RULE = re.compile(r"(?:(\w+):(?!//|=))?(?:rostopic://)?([^:]+):=(.+)", re.DOTALL)
+# A remap rule: the node it is for, what it matches, and the new name.
+_REMAP_RULE = re.compile(r"(?:(\w+):(?!//|=))?(?:rostopic://)?([^:]+):=(.+)", re.DOTALL)
 _NOT_LOADED = (
     "no launch file has a container load {}, and its shaping node is a component (what `ros2 "
     "component load` loads cannot be redirected: load it in a launch file; if it is a process, "
@@ -60,15 +61,15 @@ class Started:
 
 @dataclass
 class Redirect:
-    """A topic that nodes have another one in place of, and what was seen of that.
+    """A topic in whose place some nodes get another one, and what the launch has shown of them.
 
-    * ``kind``: of their endpoints, ``publisher`` or ``subscription``.
+    * ``kind``: of the nodes' endpoints, ``publisher`` or ``subscription``.
     * ``topic``, ``target``: the topic, and the one in its place.
     * ``nodes``: the nodes to be redirected, by their full names.
     * ``added``: the nodes that splicing added, which have the topic instead.
     * ``component``: the node that was added, if a container is to load it.
     * ``started``: processes and components that are, or may be, nodes to be redirected.
-    * ``others``: everything else that was started.
+    * ``others``: whatever was started, but for nodes that splicing added; for messages.
     * ``elsewhere``: nodes that have another topic by a remap rule of the user's.
     * ``loaded``: whether a container was asked to load the component.
     """
@@ -85,7 +86,7 @@ class Redirect:
     loaded: bool = False
 
     def values(self) -> dict[str, Any]:
-        """Return the arguments that the launch file, or a dry run, makes it again from."""
+        """Return the arguments of the same redirect in the launch file, or in a dry run."""
         keys = ("kind", "topic", "target", "nodes", "added", "component")
         values = {key: getattr(self, key) for key in keys}
         return {key: value for key, value in values.items() if value is not None}
@@ -96,7 +97,7 @@ class Redirect:
         """Note a process or component; return the rules to add, each with the place to put it.
 
         The name and namespace of its node are those of its ``rules``, or else ``given``, or else
-        the executable decides. A node that is given a name only is taken to be in no namespace.
+        the executable decides. A node with a name only is in no namespace.
         """
         name = _of_rule(rules, "__node", "__name") or given[0] or None
         namespace = _of_rule(rules, "__ns") or given[1] or None
@@ -105,9 +106,10 @@ class Redirect:
         if label not in self.added:
             self.others.append(label)
         for node in self.nodes:
-            where, _, base = node.rpartition("/")
-            there = where if namespace is None and name is None else namespace or ""
-            if name not in (None, base) or there.strip("/") != where.strip("/"):
+            parent, _, base = node.rpartition("/")
+            unknown = namespace is None and name is None
+            started_in = parent if unknown else namespace or ""
+            if name not in (None, base) or started_in.strip("/") != parent.strip("/"):
                 continue
             for_node = redirecting(rules, node, self.topic, self.target)
             if for_node is None:
@@ -136,9 +138,9 @@ class Redirect:
         if elsewhere:
             return f"nothing was redirected: {_names(elsewhere)} has another topic in place of it"
         if lacking:
-            what = "no node {} runs" if self.component is None else _NOT_LOADED
-            what = what.format(_names(lacking))
-            return f"nothing was redirected: {what}; started were {_names(self.others)}"
+            problem = "no node {} runs" if self.component is None else _NOT_LOADED
+            problem = problem.format(_names(lacking))
+            return f"nothing was redirected: {problem}; started were {_names(self.others)}"
         if self.kind == "subscription":
             past, does = [node for node in on_topic if node in self.nodes], "subscribes to"
         else:
@@ -164,20 +166,21 @@ def redirecting(
 ) -> list[tuple[int, str]] | None:
     """Return the rules that give a node a target in place of a topic, each with its place.
 
-    A rule goes before the node's rule in that place. None: the node's rules give it another topic.
+    The rule goes before the node's own rule in that place. None: the node's own rules give it
+    another topic.
     """
     base = node.rpartition("/")[2]
     added: list[tuple[int, str]] = []
     leads: dict[str, str] = {}
     for place, rule in enumerate(rules):
-        found = _RULE.fullmatch(rule)
-        if found is None or found[1] not in (None, base) or found[2].startswith("__"):
+        parts = _REMAP_RULE.fullmatch(rule)
+        if parts is None or parts[1] not in (None, base) or parts[2].startswith("__"):
             continue
-        match = expanded(found[2], node)
+        match = expanded(parts[2], node)
         if match not in leads:
-            leads[match] = expanded(found[3], node)
+            leads[match] = expanded(parts[3], node)
             if leads[match] == topic:
-                added.append((place, f"{base}:{found[2]}:={target}"))
+                added.append((place, f"{base}:{parts[2]}:={target}"))
     if topic not in leads:
         added.append((len(rules), f"{base}:{topic}:={target}"))
     return added if added or target in leads.values() else None
@@ -185,12 +188,12 @@ def redirecting(
 
 def expanded(name: str, node: str) -> str:
     """Return the full name of an absolute, relative or private (``~/…``) name in a node."""
-    where, _, base = node.rpartition("/")
+    namespace, _, base = node.rpartition("/")
     name = name.removeprefix("rostopic://").replace("{node}", base)
-    name = name.replace("{ns}", where).replace("{namespace}", where)
+    name = name.replace("{ns}", namespace).replace("{namespace}", namespace)
     if name == "~" or name.startswith("~/"):
         return node + name[1:]
-    return name if name.startswith("/") else f"{where}/{name}"
+    return name if name.startswith("/") else f"{namespace}/{name}"
 
 
 def redirect_command(
@@ -243,7 +246,7 @@ def redirect_request(request: Any, redirects: Sequence[Redirect]) -> list[Redire
 
     The request is a `composition_interfaces/srv/LoadNode`.
     """
-    redirecting_it, given = list[Redirect](), (request.node_name, request.node_namespace)
+    applied, given = list[Redirect](), (request.node_name, request.node_namespace)
     for redirect in redirects:
         rules = list(request.remap_rules)
         added = redirect.see(rules, request.plugin_name, given=given)
@@ -251,8 +254,8 @@ def redirect_request(request: Any, redirects: Sequence[Redirect]) -> list[Redire
             rules.insert(number, rule)
         request.remap_rules = rules
         if added:
-            redirecting_it.append(redirect)
-    return redirecting_it
+            applied.append(redirect)
+    return applied
 
 
 def component_request(component: dict[str, Any], publisher: Any, context: Any) -> Any:
@@ -291,7 +294,7 @@ def _places(words: Sequence[str]) -> Iterator[int]:
 
 def _of_rule(rules: Sequence[str], *kinds: str) -> str | None:
     """Return the name or namespace that rules give to every node of a process."""
-    matches = (_RULE.fullmatch(rule) for rule in rules)
+    matches = (_REMAP_RULE.fullmatch(rule) for rule in rules)
     targets = (match[3] for match in matches if match and not match[1] and match[2] in kinds)
     return next(targets, None)
 
@@ -422,9 +425,9 @@ def nodes_of(endpoints: Sequence[Any]) -> tuple[list[str], bool]:
 
     The second value says whether there are some whose node discovery has not found yet.
     """
-    known = [info for info in endpoints if info.node_name != UNKNOWN_NODE]
-    names = [f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in known]
-    return names, len(known) < len(endpoints)
+    with_node = [info for info in endpoints if info.node_name != UNKNOWN_NODE]
+    names = [f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in with_node]
+    return names, len(with_node) < len(endpoints)
 
 
 def _check(context: Any, redirects: Sequence[Redirect], looks: int = MOST_LOOKS) -> Any:

@@ -86,17 +86,19 @@ def find_outputs(folders: Iterable[str] | None = None) -> tuple[ShapedOutput, ..
     if folders is None:
         pages, folders = _in_containers(), [*page_folders()]
         if os.geteuid() == 0:
-            others = [*Path("/run/user").glob("*/chainshaper/outputs")]
-            others += Path("/dev/shm").glob("chainshaper-*")  # noqa: S108
-            folders += sorted({*map(str, others)} - {*folders})
+            of_users = [*Path("/run/user").glob("*/chainshaper/outputs")]
+            of_users += Path("/dev/shm").glob("chainshaper-*")  # noqa: S108
+            folders += sorted({*map(str, of_users)} - {*folders})
     for folder in folders:
         with suppress(OSError):
             pages += [(folder, name, {}) for name in sorted(os.listdir(folder))]  # noqa: PTH208
-    found = []
+    outputs = []
     for folder, name, pid_of in pages:
         with suppress(OSError, ValueError), closing(Page(folder, name)) as page:
-            found += _looked_at(page, pid_of)
-    return tuple(found)
+            output = _output_of(page, pid_of)
+            if output is not None:
+                outputs.append(output)
+    return tuple(outputs)
 
 
 def _in_containers() -> list[tuple[str, str, dict[int, int]]]:
@@ -105,7 +107,7 @@ def _in_containers() -> list[tuple[str, str, dict[int, int]]]:
     With each are the ids of its processes, by their ids in the container, which the page names.
     """
     namespace = Path("/proc/self/ns/mnt").stat().st_ino
-    found: dict[tuple[int, int], tuple[str, str, dict[int, int]]] = {}
+    pages: dict[tuple[int, int], tuple[str, str, dict[int, int]]] = {}  # by device and inode
     for pid in parents():
         folder = f"/proc/{pid}/fd"
         with suppress(OSError):  # it has ended, or is another user's
@@ -115,9 +117,9 @@ def _in_containers() -> list[tuple[str, str, dict[int, int]]]:
             for name in os.listdir(folder):  # noqa: PTH208
                 if _PAGE.search(os.readlink(f"{folder}/{name}")):  # noqa: PTH115
                     file = os.stat(f"{folder}/{name}")  # noqa: PTH116
-                    page = found.setdefault((file.st_dev, file.st_ino), (folder, name, {}))
+                    page = pages.setdefault((file.st_dev, file.st_ino), (folder, name, {}))
                     page[2][inner] = pid
-    return list(found.values())
+    return list(pages.values())
 
 
 def remove_abandoned_pages(folders: Iterable[str] | None = None) -> list[str]:
@@ -134,16 +136,16 @@ def remove_abandoned_pages(folders: Iterable[str] | None = None) -> list[str]:
         for name in names:
             path = f"{folder}/{name}"
             with suppress(OSError):
-                there = os.lstat(path)
-                used = (there.st_dev, there.st_ino) in opened or _has_rights(folder, name)
-                if there.st_uid == os.geteuid() and not used:
+                state = os.lstat(path)
+                used = (state.st_dev, state.st_ino) in opened or _has_rights(folder, name)
+                if state.st_uid == os.geteuid() and not used:
                     os.unlink(path)  # noqa: PTH108
                     removed.append(path)
     return removed
 
 
 def _has_rights(folder: str, name: str) -> bool:
-    """Return whether a process has a right of a page; nobody has one of a page without content."""
+    """Return whether a process has a right of a page; a page without content has none."""
     try:
         with closing(Page(folder, name)) as page:
             return any(map(page.is_locked, (PUBLISHING, STANDING_BY, PASSING, MOVING)))
@@ -174,15 +176,17 @@ def output_text(output: ShapedOutput) -> str:
         topic = f"{topic} of user {user_name(output.user)}"
     shaped = f"{topic} is shaped by process {output.shaping_node}"
     since_ns = 0 if output.since_ns is None else time.monotonic_ns() - output.since_ns
-    gone = f"for {duration_text(since_ns // 1_000_000 * 1_000_000)}, {output.messages} messages"
+    without_it = (
+        f"for {duration_text(since_ns // 1_000_000 * 1_000_000)}, {output.messages} messages"
+    )
     text = {
         "shaped": shaped,
         "in process": f"{shaped}, which publishes it",
         "no standby": f"{shaped}, but has no standby: it falls silent when that ends",
-        "bypassed": f"{topic} is bypassed {gone} go around its shaping node",
-        "silent": f"{topic} is silent {gone} were not published",
+        "bypassed": f"{topic} is bypassed {without_it} go around its shaping node",
+        "silent": f"{topic} is silent {without_it} were not published",
     }[output.state]
-    lost = "".join(f", {count} {why}" for why, count in output.lost.items())
+    lost = "".join(f", {count} {reason}" for reason, count in output.lost.items())
     if output.published or lost:
         published = f"{output.published} messages published, {output.late} late{lost}"
         text += f"; in this run so far {published}"
@@ -207,18 +211,18 @@ def _page_of(topic: str, pids: Collection[int]) -> Page:
     Without processes it is one of this user's.
     """
     of_topic = [output for output in find_outputs() if output.topic == topic]
-    found = [
+    candidates = [
         output
         for output in of_topic
         if (output.shaping_node in pids if pids else output.user in run_users())
         and output.shaping_node
     ]
-    if len(found) != 1:
+    if len(candidates) != 1:
         raise OperationError(
-            f"slots of {topic} cannot follow: {len(found) or 'no'} gates publish it now that show"
-            " their latencies; start the shaping node, one of this version"
+            f"slots of {topic} cannot follow: {len(candidates) or 'no'} gates publish it now that"
+            " show their latencies; start the shaping node, one of this version"
         )
-    folder, _, name = found[0].page.rpartition("/")
+    folder, _, name = candidates[0].page.rpartition("/")
     return Page(folder, name, flags=os.O_RDWR)
 
 
@@ -270,8 +274,8 @@ def _is_of(pid: int, user: int) -> bool:
     return False
 
 
-def _looked_at(page: Page, pid_of: Mapping[int, int]) -> list[ShapedOutput]:
-    """Return the output of a page; none: its processes have ended.
+def _output_of(page: Page, pid_of: Mapping[int, int]) -> ShapedOutput | None:
+    """Return the output of a page; None: its processes have ended.
 
     ``pid_of`` has the process ids here by those that the page names.
     """
@@ -281,29 +285,28 @@ def _looked_at(page: Page, pid_of: Mapping[int, int]) -> list[ShapedOutput]:
     holder = holder if _is_of(holder, page.owner) else 0
     standby = standby if _is_of(standby, page.owner) else 0
     if not holder and not standby:
-        return []
+        return None
     since = page["bypassing_since_ns"] if standby else 0
     state: OutputState = "in process" if page["in_process"] else "no standby"
     if since or not holder:
         state = "silent" if page["silent"] else "bypassed"
     elif standby:
         state = "shaped"
-    counts = {why: page[why.replace(" ", "_").lower()] for why in (*DROPPED, "lost by DDS")}
-    return [
-        ShapedOutput(
-            topic=_TOPIC.validate_python(page.topic),  # another user may write any text
-            state=state,
-            shaping_node=holder or None,
-            standby=standby or None,
-            since_ns=since or None,
-            messages=page["bypassed"] - page["bypassed_before"] if since else 0,
-            messages_in_all=page["bypassed"],
-            starts=page["starts"],
-            published=page["published"],
-            lost={why: count for why, count in counts.items() if count},
-            late=page["late"],
-            moved_ns=page.moved_ns,
-            page=page.path,
-            user=page.owner,
-        )
-    ]
+    reasons = (*DROPPED, "lost by DDS")
+    counts = {reason: page[reason.replace(" ", "_").lower()] for reason in reasons}
+    return ShapedOutput(
+        topic=_TOPIC.validate_python(page.topic),  # another user may write any text
+        state=state,
+        shaping_node=holder or None,
+        standby=standby or None,
+        since_ns=since or None,
+        messages=page["bypassed"] - page["bypassed_before"] if since else 0,
+        messages_in_all=page["bypassed"],
+        starts=page["starts"],
+        published=page["published"],
+        lost={reason: count for reason, count in counts.items() if count},
+        late=page["late"],
+        moved_ns=page.moved_ns,
+        page=page.path,
+        user=page.owner,
+    )

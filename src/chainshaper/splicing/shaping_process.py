@@ -25,7 +25,7 @@ from chainshaper.values.plan_choices import STANDBY, NodeLanguage
 
 @dataclass(frozen=True)
 class ShapingProcess:
-    """A shaping node or a throttler, which a launch file starts, and starts again when it ends.
+    """A shaping node or a throttler, which a launch file starts, and restarts when it ends.
 
     * ``name``: of the node.
     * ``command``: what to start, without ``--ros-args``; None: an ``executable`` of a ``package``.
@@ -117,16 +117,16 @@ def write_shaping_process(
     # A component ends with its publisher, and its standby would cost a copy of each message.
     if process.plugin is None:
         name = f"{node.name}{STANDBY}"
-        same = {key: parameters[key] for key in ("handover", "output_depth", "depth")}
-        of_standby = same | {
+        shared = {key: parameters[key] for key in ("handover", "output_depth", "depth")}
+        of_standby = shared | {
             "shaping_node": node.name,
             "fallback": plan.fallback,
             "patience_ns": _patience_ns(plan),
             "server_cores": sorted({server.core for server in plan.servers}),
             "log": "" if log is None else str(log.with_stem(name).absolute()),
         }
-        standby, others = _process("python", "standby", name, folder, of_standby, topics)
-        process, files = replace(process, standby=standby), files | others
+        standby, standby_files = _process("python", "standby", name, folder, of_standby, topics)
+        process, files = replace(process, standby=standby), files | standby_files
     _write(into or folder, files)
     return process
 
@@ -209,10 +209,11 @@ def _process(  # noqa: PLR0917 - all of a process
     package = GENERIC_PACKAGE if shaped is None else shaped.node_package
     if kind == "component":
         plugin = f"{package}::ShapingNode"
-    filled = cpp_package(shaped, component=plugin is not None)
-    files |= {f"{package}/{path}": text for path, text in filled.items()}
-    runs = executable if plugin is None else None
-    return ShapingProcess(name, None, package, runs, file, remappings, plugin), files
+    package_files = cpp_package(shaped, component=plugin is not None)
+    files |= {f"{package}/{path}": text for path, text in package_files.items()}
+    if plugin is not None:  # the container runs it
+        return ShapingProcess(name, None, package, None, file, remappings, plugin), files
+    return ShapingProcess(name, None, package, executable, file, remappings), files
 
 
 def _write(folder: Path, files: dict[str, str]) -> None:

@@ -39,7 +39,7 @@ _SIGNS = {  # what a launch file has in it, by the end of its name; only launch 
     **dict.fromkeys((".yaml", ".yml"), r"(?m)^[\s'\"{]*launch\b"),
     ".launch": "launch",
 }
-_TEXT = '''"""Starts {what} with nodes added; written by `chainshaper splice`."""
+_TEXT = '''"""Starts {launched} with nodes added; written by `chainshaper splice`."""
 
 import importlib.util
 from pathlib import Path
@@ -124,15 +124,15 @@ def _file_of_package(package: str, name: str) -> Path:
         )
     if not name:
         raise InputError(f"no launch file given: `ros2 launch {package} FILE`")
-    found = [Path(folder) / name for folder, _, files in os.walk(share) if name in files]
-    if not found:
+    paths = [Path(folder) / name for folder, _, files in os.walk(share) if name in files]
+    if not paths:
         raise InputError(f"package {package} has no launch file {name} in {share}")
-    if len(found) > 1:
+    if len(paths) > 1:
         raise InputError(
-            f"package {package} has {len(found)} files {name}: give the path of the one that is "
-            f"meant, {' or '.join(map(str, sorted(found)))}"
+            f"package {package} has {len(paths)} files {name}: give the path of the one that is "
+            f"meant, {' or '.join(map(str, sorted(paths)))}"
         )
-    return found[0]
+    return paths[0]
 
 
 def launch_file_name(words: Sequence[str]) -> str:
@@ -160,9 +160,9 @@ def launch_text(
     if is_run(words):
         files = []
         actions.append({"cmd": [*words], "output": "screen"})
-    what = executable_of(words) or ", ".join(Path(word).name for word in words)
+    launched = executable_of(words) or ", ".join(Path(word).name for word in words)
     return _TEXT.format(
-        what=re.sub(r"[^\w., -]", "_", what),  # so a file's name cannot end the docstring
+        launched=re.sub(r"[^\w., -]", "_", launched),  # so a file's name cannot end the docstring
         files=pformat(files, width=96),
         processes=pformat(actions, width=96, sort_dicts=False),
         redirects=pformat(
@@ -196,7 +196,7 @@ def original_words(words: Sequence[str], *, throttled: bool = False) -> list[str
     """
     if is_run(words):
         return list(words)
-    found: list[str] = []
+    originals: list[str] = []
     for word in words:
         file = Path(word).absolute()
         manifest = _manifest(file.parent)
@@ -212,7 +212,7 @@ def original_words(words: Sequence[str], *, throttled: bool = False) -> list[str
                     f"{file}: no launch file: it has no `launch`, or no"
                     " `generate_launch_description`"
                 )
-            found.append(str(file))
+            originals.append(str(file))
             continue
         copied = original_words(manifest["copies"][file.name], throttled=throttled)
         if is_run(copied) and len(words) > 1:
@@ -220,8 +220,8 @@ def original_words(words: Sequence[str], *, throttled: bool = False) -> list[str
                 f"{file} stands for `{' '.join(copied)}`, which is spliced alone: splice it into"
                 " another folder, or write a launch file that starts it"
             )
-        found += copied
-    return list(dict.fromkeys(found)) if not is_run(found) else found
+        originals += copied
+    return originals if is_run(originals) else list(dict.fromkeys(originals))
 
 
 def usable(folder: Path) -> Path:
@@ -243,8 +243,10 @@ def _refuse_changed(folder: Path, consequence: str) -> None:
         raise InputError(
             f"{folder} was not written by `chainshaper splice`, so it is {consequence}"
         )
-    known = manifest["files"]
-    changed = sorted(name for name, digest in _hashes(folder).items() if known.get(name) != digest)
+    written = manifest["files"]
+    changed = sorted(
+        name for name, digest in _hashes(folder).items() if written.get(name) != digest
+    )
     if changed:
         raise InputError(
             f"{folder}: {', '.join(changed)} was changed or added since it was written, so it is"
@@ -272,13 +274,13 @@ def _manifest(folder: Path) -> dict[str, Any] | None:
 
 def _hashes(folder: Path) -> dict[str, str]:
     """Return the hash of every file that counts, by its path below the folder."""
-    found: dict[str, str] = {}
+    hashes: dict[str, str] = {}
     for path in folder.rglob("*"):
         name = path.relative_to(folder)
         derived = "__pycache__" in name.parts or not _DERIVED.isdisjoint(map(str, name.parents))
         if path.is_file() and not derived and str(name) != MANIFEST:
-            found[str(name)] = hashlib.sha256(path.read_bytes()).hexdigest()
-    return found
+            hashes[str(name)] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return hashes
 
 
 @contextmanager
@@ -291,8 +293,8 @@ def new_folder(
     OperationError: it cannot be written; nothing is left behind, and an older folder stays.
     """
     try:
-        with folder_beside(folder) as made:
-            partial = Path(made)
+        with folder_beside(folder) as partial_name:
+            partial = Path(partial_name)
             write_whole(partial / "redirection.py", [Path(redirection.__file__).read_bytes()])
             yield partial
             (partial / LOGS).mkdir()

@@ -1,6 +1,7 @@
 """What became of the outputs that were due, and whether a plan's promise about them was kept.
 
-A plan promises that at most a certain share of the outputs that are due misses its slot. An output
+A plan promises that at most a certain share of the outputs that are due misses its slot
+(:func:`~chainshaper.planning.margins.allowed_late_share`). An output
 that never comes is not in time either, for whatever reason: it was discarded, lost on the way or
 never published, or its chain did not begin. So all of these count. Comparisons, sweeps, watches and
 budgets all judge by this module.
@@ -16,6 +17,7 @@ import polars as pl
 from chainshaper.analysis import LatencyAnalysis
 from chainshaper.planning import ChainPlan
 from chainshaper.planning.chain_plan import Evidence
+from chainshaper.planning.margins import allowed_late_share
 
 STANDARD_ERRORS = 3  # a figure that is off by more is not what was predicted
 NOT_PUBLISHED, NOT_BEGUN, NEVER_CAME = "not published", "not begun", "never came"
@@ -41,7 +43,9 @@ class OutputsDue:
         absent, due, usual = {NEVER_CAME: incomplete} if incomplete else {}, count + incomplete, 0
         if plan is not None:
             usual = _usual(plan.evidence, plan.evidence.incomplete, due, incomplete)
-        return cls(due, late, absent, usual, None if plan is None else promised_by(plan))
+        return cls(
+            due, late, absent, usual, None if plan is None else allowed_late_share(plan.margin)
+        )
 
     @property
     def missed(self) -> int:
@@ -84,11 +88,6 @@ def most_by_chance(count: int, share: float) -> int:
     return math.floor(mean + STANDARD_ERRORS * math.sqrt(mean))
 
 
-def promised_by(plan: ChainPlan) -> float:
-    """The largest share of outputs that may be missed under a plan."""
-    return plan.margin.overrun_probability or 0.0
-
-
 def _usual(evidence: Evidence, before: int, due: int, absent: int) -> int:
     """How many of ``absent`` outputs are as usual.
 
@@ -124,5 +123,5 @@ def _counted(traversals: pl.DataFrame, not_begun: int, plan: ChainPlan | None) -
         late=int(due["late"].sum() or 0) if known else None,
         absent={reason: number for reason, number in absent.items() if number},
         usual=usual,
-        promised=None if plan is None else promised_by(plan),
+        promised=None if plan is None else allowed_late_share(plan.margin),
     )

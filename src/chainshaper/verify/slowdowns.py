@@ -109,8 +109,8 @@ class Compared:
         return f"{self.node} ({self.starts})"
 
     @property
-    def what(self) -> str:
-        """Text: the figure that was compared."""
+    def figure(self) -> str:
+        """Text: the time that was compared, and with what."""
         return f"{self.time} beside the baseline"
 
     @property

@@ -49,7 +49,7 @@ from pathlib import Path
 from time import monotonic_ns
 from typing import Any, Generic, TypeAlias, TypeVar
 
-from chainshaper.linux.own_processes import named_folders
+from chainshaper.linux.child_processes import named_folders
 from chainshaper.linux.scheduling import set_thread_name
 from chainshaper.robot.serialized import origin_of
 from chainshaper.values.files import why_distrusted

@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import IO, TYPE_CHECKING, Any, TextIO, TypeVar
 
-from chainshaper.linux.own_processes import end_in_words, module_command
+from chainshaper.linux.child_processes import end_in_words, module_command
 from chainshaper.values.errors import OperationError
 
 if TYPE_CHECKING:  # a stall meter runs with the standard library alone

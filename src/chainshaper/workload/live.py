@@ -20,7 +20,7 @@ import numpy.typing as npt
 import polars as pl
 
 from chainshaper.enforcement.journal import Governed, governing, in_force_throughout
-from chainshaper.linux.own_processes import LIBRARIES
+from chainshaper.linux.child_processes import LIBRARIES
 from chainshaper.linux.scheduling import (
     SchedulingRequest,
     apply_scheduling,

@@ -37,7 +37,7 @@ from chainshaper.enforcement.scx.libbpf import (
     load_libbpf,
 )
 from chainshaper.enforcement.servers import BackEnd, ServerCounters, ServerTable, server_named
-from chainshaper.linux.own_processes import start_module, what_happened
+from chainshaper.linux.child_processes import start_module, what_happened
 from chainshaper.linux.scheduling import (
     check_cores,
     lock_memory,

@@ -31,7 +31,7 @@ from chainshaper.flow.plan_in_force.anchor import AnchoredPlan
 from chainshaper.flow.plan_in_force.report import RunReport
 from chainshaper.flow.server_tables import order_in
 from chainshaper.flow.threads import find_threads
-from chainshaper.linux.own_processes import end_in_words
+from chainshaper.linux.child_processes import end_in_words
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.planning.plan import Plan
 from chainshaper.values.errors import OperationError

@@ -9,7 +9,7 @@ import polars as pl
 
 from chainshaper.analysis import DataFlow, LatencyAnalysis, executors
 from chainshaper.analysis.disturbance import overlapping
-from chainshaper.analysis.latency import Executor
+from chainshaper.analysis.latency import RecordedExecutor
 from chainshaper.flow.recorded_profile.stages import Stage
 from chainshaper.planning.profile import Interfering
 from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph
@@ -20,7 +20,7 @@ from chainshaper.values.recording import Recording
 class ChainExecutors:
     """The executors that run a chain and its branches."""
 
-    running: Sequence[Executor]
+    running: Sequence[RecordedExecutor]
     # Node with several executors → those that take part, each by the names of its callbacks. Only
     # nodes whose callbacks have names of their own are in it.
     named: Mapping[str, tuple[tuple[str, ...], ...]]
@@ -82,7 +82,10 @@ def nodes_sharing_processes(
 
 
 def interfering_callbacks(
-    flow: DataFlow, analysis: LatencyAnalysis, running: Sequence[Executor], planned: Collection[int]
+    flow: DataFlow,
+    analysis: LatencyAnalysis,
+    running: Sequence[RecordedExecutor],
+    planned: Collection[int],
 ) -> tuple[Interfering, ...]:
     """Return what else the executors of a chain run while its complete traversals last."""
     cycles = analysis.traversals.filter("complete")
@@ -115,7 +118,7 @@ def utilisation(
     flow: DataFlow,
     graph: ApplicationGraph,
     core_of: Mapping[str, int],
-    running: Sequence[Executor],
+    running: Sequence[RecordedExecutor],
 ) -> float | None:
     """Return the largest share of a core that the executors of a chain take."""
     ran_ids = {number for executor in running for number in executor.callbacks}

@@ -1,5 +1,6 @@
-"""What the nodes have in common on the side of ROS 2: parameters, topics, trace points, real-time
-scheduling, and the log of a gate. Written for rclpy of Humble to Rolling.
+"""The nodes' common part on the side of ROS 2, for rclpy of Humble to Rolling.
+
+It has parameters, topics, trace points, real-time scheduling, and the log of a gate.
 """
 
 import atexit
@@ -37,11 +38,11 @@ from chainshaper.robot.shaper import READER_DEPTH
 from chainshaper.robot.waiting import Outcome
 
 HUMBLE = not hasattr(Subscription, "CallbackType")
-"""There a callback gets the message only, and serialized messages pass no trace points."""
+"""On Humble a callback gets the message only, and serialized messages pass no trace points."""
 
 
 def parameters_of(node: Node) -> NodeParameters:
-    """Return what the parameter file says, and defaults for the rest."""
+    """Return a node's parameters: those of its file, and defaults for the rest."""
     return parameters_from(
         {
             name: node.get_parameter_or(name, Parameter(name, value=default)).value
@@ -50,19 +51,21 @@ def parameters_of(node: Node) -> NodeParameters:
     )
 
 
-def delivery_core(taken: list[int]) -> int | None:
-    """Where DDS threads deliver the output: the first core that is ours to use and has no server.
+def delivery_core(server_cores: list[int]) -> int | None:
+    """Return the core where DDS threads deliver the output.
 
-    None: the plan names no server's core, since it leaves receivers alone; or, with Fast DDS before
-    2.13 (Jazzy), they have no names, so no priority there, and would wait while the core is clear.
+    It is the first one that this process may use and that has no server. None: the plan names no
+    server's core, because it leaves receivers alone; or the middleware is Fast DDS before 2.13
+    (Jazzy), whose threads have no names, so they get no priority, and would wait while the core is
+    cleared.
     """
     nameless = HUMBLE and get_rmw_implementation_identifier().startswith("rmw_fastrtps")
-    ours = os.sched_getaffinity(0) - set(taken)
-    return min(ours, default=None) if taken and not nameless else None
+    usable = os.sched_getaffinity(0) - set(server_cores)
+    return min(usable, default=None) if server_cores and not nameless else None
 
 
 def wait(seconds: float) -> None:
-    """Wait; ExternalShutdownException: the process is to stop."""
+    """Wait. Raises ExternalShutdownException: the process has to stop."""
     until = time.monotonic() + seconds
     while rclpy.ok() and (left := until - time.monotonic()) > 0:
         time.sleep(min(left, 0.05))
@@ -71,48 +74,54 @@ def wait(seconds: float) -> None:
 
 
 def wait_for_publisher(node: Node, topic: str) -> Any:
-    """A topic's publisher as discovery knows it (`TopicEndpointInfo`), once there is one."""
-    logger, name, said = node.get_logger(), node.resolve_topic_name(topic), False
-    while not (found := [i for i in node.get_publishers_info_by_topic(topic) if i.topic_type]):
-        if not said:
+    """Wait until a topic has a publisher; return that (`TopicEndpointInfo`)."""
+    logger, name, is_reported = node.get_logger(), node.resolve_topic_name(topic), False
+    while not (publishers := _typed_publishers(node, topic)):
+        if not is_reported:
             logger.info(f"waiting for a publisher of {name}")
-        said = True
+        is_reported = True
         wait(0.01)
-    if len(found) > 1:
-        logger.warning(f"{name} has {len(found)} publishers: the QoS of the first is copied")
-    node_name = f"{found[0].node_namespace.rstrip('/')}/{found[0].node_name}"
-    logger.info(f"{name} is published by {node_name} as {found[0].topic_type}")
-    return found[0]
+    first = publishers[0]
+    if len(publishers) > 1:
+        logger.warning(f"{name} has {len(publishers)} publishers: the QoS of the first is copied")
+    node_name = f"{first.node_namespace.rstrip('/')}/{first.node_name}"
+    logger.info(f"{name} is published by {node_name} as {first.topic_type}")
+    return first
+
+
+def _typed_publishers(node: Node, topic: str) -> list[Any]:
+    """Return the publishers of a topic whose type discovery knows already."""
+    return [info for info in node.get_publishers_info_by_topic(topic) if info.topic_type]
 
 
 def message_class(type_name: str) -> Any:
-    """The class of a type such as ``sensor_msgs/msg/Image``; rclpy cannot do without."""
+    """Return the class of a type such as ``sensor_msgs/msg/Image``, which rclpy needs."""
     package, kind, name = type_name.split("/")
     return getattr(importlib.import_module(f"{package}.{kind}"), name)
 
 
 def offered_by(info: Any, node: Node) -> QoSProfile:
-    """The quality of service of a publisher, for the one that stands in for it.
+    """Return the quality of service of a publisher, for the publisher in its place.
 
-    Discovery does not know everything: what is unknown is taken to be usual, and the history to
-    keep the last ``output_depth``.
+    Discovery does not know everything. For what is unknown, the usual value is assumed, and a
+    history that keeps the last ``output_depth`` messages.
     """
     offered = info.qos_profile
-    alike = ("lifespan", "deadline", "liveliness_lease_duration")
-    known = {name: getattr(offered, name) for name in alike}
-    for name, kind, either, usual in (
+    copied = ("lifespan", "deadline", "liveliness_lease_duration")
+    values = {name: getattr(offered, name) for name in copied}
+    for name, kind, exception, usual in (
         ("history", policies.QoSHistoryPolicy, "KEEP_ALL", "KEEP_LAST"),
         ("reliability", policies.QoSReliabilityPolicy, "BEST_EFFORT", "RELIABLE"),
         ("durability", QoSDurabilityPolicy, "TRANSIENT_LOCAL", "VOLATILE"),
         ("liveliness", policies.QoSLivelinessPolicy, "MANUAL_BY_TOPIC", "AUTOMATIC"),
     ):
-        there = getattr(offered, name) == kind[either]
-        known[name] = kind[either if there else usual]
-    return QoSProfile(depth=offered.depth or parameters_of(node).output_depth, **known)
+        is_exception = getattr(offered, name) == kind[exception]
+        values[name] = kind[exception if is_exception else usual]
+    return QoSProfile(depth=offered.depth or parameters_of(node).output_depth, **values)
 
 
 def asked_of(offered: QoSProfile, depth: int = 0) -> QoSProfile:
-    """With what to subscribe to a publisher: its reliability and durability, and nothing more."""
+    """Return the QoS of a subscription to a publisher: its history, reliability and durability."""
     return QoSProfile(
         history=offered.history,
         depth=depth or offered.depth,
@@ -122,11 +131,11 @@ def asked_of(offered: QoSProfile, depth: int = 0) -> QoSProfile:
 
 
 def room_of(node: Node, info: Any) -> tuple[int, QoSProfile, QoSProfile]:
-    """How many messages may wait at the gate of a topic, and the QoS of its output and input."""
+    """Return how many messages may wait at a topic's gate, and the QoS of its output and input."""
     offered = offered_by(info, node)
     depth = parameters_of(node).depth or max(DEPTH, offered.depth)
     if offered.durability != QoSDurabilityPolicy.TRANSIENT_LOCAL:
-        # What leaves in one slot must find room in the writer, too.
+        # The writer needs room for all messages that leave in one slot.
         offered.depth = max(offered.depth, depth)
     return depth, offered, asked_of(offered, max(READER_DEPTH, depth))
 
@@ -134,14 +143,14 @@ def room_of(node: Node, info: Any) -> tuple[int, QoSProfile, QoSProfile]:
 def become_realtime(node: Node) -> None:
     """Lock the memory, and give the calling thread its core and SCHED_FIFO priority, as permitted.
 
-    To be called when all endpoints exist: threads inherit, and those of DDS must not; later ones do
-    not get the class.
+    To be called when all endpoints exist: new threads inherit the core, and threads of DDS must
+    not. (They do not inherit the priority.)
     """
     parameters = parameters_of(node)
     core, priority = parameters.core, parameters.fifo_priority
 
-    def warn(what: str, remedy: str) -> None:
-        node.get_logger().warning(f"{what}; it works on without: {remedy}")
+    def warn(problem: str, remedy: str) -> None:
+        node.get_logger().warning(f"{problem}; it works on without: {remedy}")
 
     if ctypes.CDLL(None).mlockall(1 | 2):  # MCL_CURRENT | MCL_FUTURE
         warn("memory cannot be locked", "give the user a memlock limit of unlimited")
@@ -163,11 +172,13 @@ def become_realtime(node: Node) -> None:
 
 
 def run(name: str, set_up: Callable[[Node], Callable[[], bool]], *, realtime: bool = True) -> None:
-    """Run a node until it is interrupted: ``set_up`` makes its endpoints. What it returns is called
-    behind each callback, and says whether it wants to be called again although nothing has come.
+    """Run a node until it is interrupted.
+
+    ``set_up`` makes the node's endpoints and returns a function, which is called behind each
+    callback; that returns True to be called again before another message comes.
     """
     rclpy.init()
-    # What is in the parameter file, is declared.
+    # The parameter file declares the parameters.
     node = Node(name, automatically_declare_parameters_from_overrides=True)
     try:
         work_off = set_up(node)
@@ -197,7 +208,7 @@ def run(name: str, set_up: Callable[[Node], Callable[[], bool]], *, realtime: bo
 # which takes a microsecond, they make LTTng write its events and uprobes fire. Where that library
 # is not loaded, or was built without tracing, no event is emitted.
 
-_ARGUMENTS = {  # so many has each event, all of them integers, pointers or texts
+_ARGUMENTS = {  # how many arguments each event has: integers, pointers or texts
     **{"rclcpp_subscription_init": 2, "rclcpp_subscription_callback_added": 2},
     **{"rclcpp_timer_callback_added": 2, "rclcpp_timer_link_node": 2},
     **{"rclcpp_callback_register": 2, "callback_start": 2, "callback_end": 1},
@@ -207,14 +218,14 @@ _ARGUMENTS = {  # so many has each event, all of them integers, pointers or text
 
 @functools.cache
 def _events() -> dict[str, Any]:
-    """The functions of all events; none where the library is not loaded, or lacks one.
+    """Return the functions of all events; none where the library is not loaded, or lacks one.
 
-    What stands in front of it for the whole process (LD_PRELOAD) comes first, and hands events on.
+    A library that LD_PRELOAD puts in front of that one is asked first, and hands events on.
     """
     functions: dict[str, Any] = {}
-    for place in ("libtracetools.so", None):
+    for file in ("libtracetools.so", None):  # None: the whole process
         with suppress(OSError, AttributeError):
-            library = ctypes.CDLL(place, mode=os.RTLD_NOLOAD)
+            library = ctypes.CDLL(file, mode=os.RTLD_NOLOAD)
             functions = {name: getattr(library, f"ros_trace_{name}") for name in _ARGUMENTS}
     for name, function in functions.items():
         function.argtypes, function.restype = (ctypes.c_void_p,) * _ARGUMENTS[name], None
@@ -228,9 +239,9 @@ def emit(name: str, *values: int | bytes) -> None:
 
 
 def _traced(callback: Callable[..., None]) -> Callable[..., None]:
-    """A callback with its events; its handle is its address."""
+    """Return a callback that emits its events; its handle is its address."""
 
-    @functools.wraps(callback)  # rclpy looks how many arguments it takes
+    @functools.wraps(callback)  # rclpy inspects how many arguments a callback takes
     def traced(*arguments: Any) -> None:
         emit("callback_start", handle, False)
         try:
@@ -243,7 +254,7 @@ def _traced(callback: Callable[..., None]) -> Callable[..., None]:
 
 
 def take_event(subscription: Any) -> Callable[[int, int], None]:
-    """What emits the event of a take: of the message at an address, with its source timestamp."""
+    """Return a function that emits a take: of a message's address and source timestamp."""
     if not _events():
         return lambda *_: None
     handle_of = ctypes.CDLL("librcl.so", mode=os.RTLD_NOLOAD).rcl_subscription_get_rmw_handle
@@ -261,11 +272,11 @@ def create_subscription(
     *,
     raw: bool = False,
 ) -> Any:
-    """`Node.create_subscription`, with the events of rclcpp's.
+    """Create a subscription (`Node.create_subscription`) that emits the events of rclcpp's.
 
-    On Humble a raw one emits the event of each take, too. In place of the source timestamp, which
-    is not known there, stands the time of the call, or the one that it is given: the publication
-    that the analysis looks for is the latest before.
+    On Humble a raw one emits the event of each take, too. The source timestamp is not known there:
+    the event has the time of the call in its place, or the time that the callback is given. The
+    analysis takes the latest publication before it.
     """
     traced = _traced(callback)
     subscription = node.create_subscription(message_type, topic, traced, qos, raw=raw)
@@ -284,7 +295,7 @@ def create_subscription(
 
 
 def create_timer(node: Node, period_ns: int, callback: Callable[[], None]) -> None:
-    """`Node.create_timer` on CLOCK_MONOTONIC, with the events of rclcpp's."""
+    """Create a timer (`Node.create_timer`) on CLOCK_MONOTONIC that emits the events of rclcpp's."""
     traced, clock = _traced(callback), Clock(clock_type=ClockType.STEADY_TIME)
     # rclpy takes seconds and cuts off behind the nanosecond.
     timer = node.create_timer((period_ns + 0.5) / 1e9, traced, clock=clock)
@@ -294,7 +305,7 @@ def create_timer(node: Node, period_ns: int, callback: Callable[[], None]) -> No
 
 
 def publish_function(publisher: Any) -> Callable[[bytes], None]:
-    """`publisher.publish` for serialized messages, with its events."""
+    """Return a function that publishes serialized messages and emits the events of that."""
     publish: Callable[[bytes], None] = publisher.publish
     if not HUMBLE:
         return publish
@@ -311,9 +322,9 @@ def publish_function(publisher: Any) -> Callable[[bytes], None]:
 # The log -----------------------------------------------------------------------------------------
 #
 # A process of its own writes the file, so that neither a slow disk nor a full one can delay the
-# gate: that only puts a line into a pipe, and goes on without it where the pipe is full. What is in
-# the pipe is written although the gate is killed. Missing rows show by their numbers. Whoever has
-# the folder may put a link in the file's place: it is not followed.
+# gate: the gate only puts a line into a pipe, and drops the line where the pipe is full. Lines that
+# are in the pipe are written even if the gate is killed. Rows have numbers, which show what is
+# missing. The owner of the folder may put a link in the file's place: it is not followed.
 
 LOG_HEADER = f"{','.join(LOG_COLUMNS)}\n".encode()
 
@@ -332,7 +343,7 @@ def _write_rows(path: str, header: bytes, most_bytes: int) -> None:
         with os.fdopen(os.open(path, flags | os.O_NOFOLLOW, 0o644), "ab", 0) as file:
             state = os.fstat(file.fileno())
             if state.st_nlink > 1 or state.st_uid != os.geteuid():
-                raise OSError  # somebody else's was put in its place
+                raise OSError  # another user has put a file in its place
             size = file.tell()
             if size <= len(header) or size + len(text) <= most_bytes // 2:
                 whole = text if size else header + text
@@ -359,15 +370,16 @@ def _write_rows(path: str, header: bytes, most_bytes: int) -> None:
 
 
 class GateLog:
-    """What a gate did, a row per message if there is a file, and the sums of what it lost."""
+    """The log of a gate, with a row for each message if it has a file, and counts of losses."""
 
     def __init__(self, node: Node) -> None:
         parameters = parameters_of(node)
         self._logger = node.get_logger()
         self._pipe: int | None = None
         self._process = f"{os.getpid()},{threading.get_native_id()}"
-        self._rows = self._said_ns = 0
-        self._lost, self._said = Counter[str](), Counter[str]()
+        self._rows = self._warned_ns = 0
+        # Messages that were lost so far, by reason, and those that a warning has named.
+        self._lost, self._reported = Counter[str](), Counter[str]()
         if parameters.log:
             self._start_writer(parameters.log, parameters.log_bytes)
 
@@ -397,8 +409,10 @@ class GateLog:
     def write(
         self, outcome: Outcome, published: int | None = None, stalled: int | None = None
     ) -> None:
-        """Note what became of a message: when publishing returned, and for how long the machine
-        stood still behind the release (ns, None: not known).
+        """Note what became of a message.
+
+        * ``published``: when publishing returned (ns of CLOCK_MONOTONIC); None: it was dropped.
+        * ``stalled``: for how long the machine stood still behind the release (ns); None: unknown.
         """
         release, message = outcome.release, outcome.message
         self._rows += 1
@@ -420,8 +434,9 @@ class GateLog:
             except OSError:
                 self._lost["not in the log"] += 1
         now = time.monotonic_ns()
-        if self._lost == self._said or (self._said_ns and now - self._said_ns < 10_000_000_000):
+        warned_lately = self._warned_ns and now - self._warned_ns < 10_000_000_000
+        if self._lost == self._reported or warned_lately:
             return
-        self._said_ns, self._said = now, self._lost.copy()
-        lost = ", ".join(f"{count} {why}" for why, count in self._lost.items())
+        self._warned_ns, self._reported = now, self._lost.copy()
+        lost = ", ".join(f"{count} {reason}" for reason, count in self._lost.items())
         self._logger.warning(f"of {self._rows} messages so far: {lost}")

@@ -1,9 +1,9 @@
 """The latency-shaping node, for messages of any type (paper, section 3.2.2).
 
 It republishes on ``output`` what it receives on ``input``, byte for byte, in the slots of its
-server. Its one thread receives, holds, publishes, rests so that the message is delivered although
-this thread out-ranks others, and only then notes what it did. What comes meanwhile waits at the
-gate, and a callback is executed for it when it is its turn.
+server. Its one thread receives, holds and publishes a message, rests so that the message is
+delivered although this thread out-ranks others, and only then writes its log. Messages that come
+meanwhile wait at the gate; a callback is executed for each when it is the oldest.
 """
 
 import gc
@@ -44,15 +44,15 @@ from chainshaper.robot.waiting import Outcome
 DISCOVERY_S, SETTLING_S = 2.0, 0.1
 REHEARSAL_TOPIC = "/_chainshaper_rehearsal"  # of all shaping nodes; the underscore hides it
 EMPTY = bytes((0, 1, 0, 0, 0))  # a serialized std_msgs/Empty
-REHEARSAL_NS = 400_000  # none begins later before a release: the first may take most of it
+REHEARSAL_NS = 400_000  # no rehearsal begins later before a release: the first may take as long
 
 
 class Readiness:
-    """What follows a release takes the same time in every cycle: rehearsed, and on awake cores.
+    """Makes a publication take the same time in every cycle: rehearsed, on cores that are awake.
 
     The chain has run since the last publication, so its code and data have left the processor's
     caches. Shortly before each release a message without receivers goes the way of the real one
-    through ROS 2 and DDS, and a datagram to ourselves that through the network stack.
+    through ROS 2 and DDS, and a datagram to this process goes that through the network stack.
 
     While `/dev/cpu_dma_latency` is open, cores wake up within the microseconds written there
     (Documentation/power/pm_qos_interface.rst).
@@ -61,7 +61,7 @@ class Readiness:
     AWAKE, AS_USUAL = (value.to_bytes(4, sys.byteorder, signed=True) for value in (0, -1))
 
     def __init__(self, node: Node, delivery_core: int | None, pause_ns: int) -> None:
-        """The output is delivered on that core, for ``pause_ns`` after it was published."""
+        """Prepare for outputs that are delivered on a core, for ``pause_ns`` behind publication."""
         self._delivery_core = None if delivery_core is None else ClearCore(delivery_core)
         self._pause_ns = pause_ns
         self._rehearsal = node.create_publisher(Empty, REHEARSAL_TOPIC, 1)
@@ -80,11 +80,11 @@ class Readiness:
             )
 
     def get_ready(self, release_ns: int) -> None:
-        """For a release at that time of CLOCK_MONOTONIC, as far as there is time left for it."""
+        """Prepare a release at that time (ns of CLOCK_MONOTONIC), as far as time is left."""
         self.ask_for(self.AWAKE)
         if self._delivery_core is not None:
             self._delivery_core.clear_until(release_ns + self._pause_ns)
-        for _ in range(2):  # the second time all that the first has loaded is in order
+        for _ in range(2):  # the first loads caches
             if time.monotonic_ns() > release_ns - REHEARSAL_NS:
                 return
             self._rehearsal.publish(EMPTY)
@@ -93,13 +93,16 @@ class Readiness:
                 self._to_itself.recv(len(EMPTY))
 
     def ask_for(self, latency: bytes = AS_USUAL) -> None:
-        """How fast cores wake up from now on; by default they may sleep."""
+        """Ask the kernel for cores that wake up fast; by default they may sleep as they like."""
         if self._latency >= 0:
             os.write(self._latency, latency)
 
 
 def listen_to_modes(node: Node, shaper: Shaper, topic: str) -> None:
-    """Subscribe to the topic of the modes, as stored by its publishers once they are discovered."""
+    """Subscribe to the topic of modes, with the durability of its publishers.
+
+    To be called when discovery knows these.
+    """
     qos, logger = QoSProfile(depth=10), node.get_logger()
     for info in node.get_publishers_info_by_topic(topic):
         if info.qos_profile.durability == QoSDurabilityPolicy.TRANSIENT_LOCAL:
@@ -115,16 +118,17 @@ def listen_to_modes(node: Node, shaper: Shaper, topic: str) -> None:
 
 
 def turn_of(node: Node, name: str) -> Turn | None:
-    """What is agreed with the standby on the page of this name; None: the node is alone.
+    """Return what the node agrees with its standby on the page of this name; None: it has none.
 
-    To be called before what may fail: one that follows several that failed at once waits here.
+    To be called before anything that may fail: a node whose predecessors have failed at once
+    several times waits here.
     """
     if not name:
         return None
     logger = node.get_logger()
     try:
         turn = Turn(name, node.resolve_topic_name("output"))
-    except OSError as error:  # the standby has none either
+    except OSError as error:  # the standby has no page either
         logger.error(f"nothing can be agreed with the standby, which does nothing: {error}")
         return None
     if turn.wait_s:
@@ -143,15 +147,15 @@ class Shaping:
         self._log = GateLog(node)
         self._pause_ns = parameters.pause_ns
         self._readiness = Readiness(node, delivery_core(parameters.server_cores), self._pause_ns)
-        parameters.gate()  # one that makes no sense is refused before its input is there
+        parameters.gate()  # a gate that makes no sense is refused before its input is there
         info = wait_for_publisher(node, "input")
         depth, offered, asked = room_of(node, info)
         self._shaper = Shaper(parameters.gate(depth), parameters.spin_ns)
         self._shaper.on_waking, self._shaper.look = self._readiness.get_ready, self._look
         if self._turn is not None:
             self._turn.go_on(self._shaper)
-        self._number: int | None = None  # the publisher's, of the last message
-        self._its_turn = False  # of the oldest message
+        self._last_number: int | None = None  # of the last message, which its publisher gave it
+        self._its_turn = False  # the callback is executed for the oldest message
         node.add_on_set_parameters_callback(self._parameters_set)
         self._type = message_class(info.topic_type)
         publisher = node.create_publisher(self._type, "output", offered)
@@ -165,16 +169,16 @@ class Shaping:
         self._await_receivers(node, publisher)
 
     def _parameters_set(self, parameters: Any) -> Any:
-        """``phase_ns`` may be set while the node runs, in force from the next cycle on."""
-        for one in parameters:
-            if one.name == "phase_ns":
-                self._shaper.queue.set_phase(one.value, time.monotonic_ns())
+        """Take over a ``phase_ns`` that is set while the node runs, from the next cycle on."""
+        for parameter in parameters:
+            if parameter.name == "phase_ns":
+                self._shaper.queue.set_phase(parameter.value, time.monotonic_ns())
         return SetParametersResult(successful=True)
 
     def _await_receivers(self, node: Node, publisher: Any) -> None:
         """Leave the output to the standby, if there is one, until its receivers know this node too.
 
-        How far discovery has come at the other side cannot be seen: it is given a little longer.
+        This node cannot see whether discovery has ended on their side: it waits a little longer.
         """
         topic, give_up = node.resolve_topic_name("output"), time.monotonic() + DISCOVERY_S
         page = None if self._turn is None else self._turn.page
@@ -185,22 +189,25 @@ class Shaping:
             wait(0.01)
 
     def work_off(self) -> bool:
-        """Have the subscription's callback deal with what waits at the gate, until there is time
-        for the node's other callbacks; whether some are left.
+        """Deal with the messages that wait at the gate; return whether some are left.
+
+        The subscription's callback deals with them, until there is time for the node's other
+        callbacks.
         """
         waiting, overflowed = self._shaper.queue.waiting, self._shaper.overflowed
         served = False
         while rclpy.ok():
-            for gone in overflowed:
-                self._note(gone)
+            for outcome in overflowed:
+                self._note(outcome)
             overflowed.clear()
             if not waiting or (served and self._shaper.nothing_due()):
                 break
             oldest, self._its_turn = waiting[0], True
-            # Others were taken since, and a callback is for the last that was.
+            # Newer messages were taken since. In a trace a callback is for the last one taken: this
+            # message is taken again.
             if HUMBLE:
-                came = oldest.arrival_ns + clock_offset()
-                self._input.callback(oldest.payload, oldest.about or came)
+                arrival = oldest.arrival_ns + clock_offset()  # CLOCK_REALTIME
+                self._input.callback(oldest.payload, oldest.about or arrival)
             else:
                 self._take(id(self._input), oldest.about or 0)
                 self._input.callback(oldest.payload, {})
@@ -208,10 +215,10 @@ class Shaping:
         return bool(waiting)
 
     def _shape(self, payload: bytes, info: dict[str, int]) -> None:
-        if not self._its_turn:  # the executor took it
-            alone = not self._shaper.queue.waiting
+        if not self._its_turn:  # the executor took the message
+            is_alone = not self._shaper.queue.waiting
             self._arrive(payload, info, waited=False)
-            if not alone:
+            if not is_alone:
                 return
         key, turn = self._shaper.queue.waiting[0].about, self._turn
         if turn is not None and not turn.take(key):
@@ -232,7 +239,7 @@ class Shaping:
             except RuntimeError:  # rclpy's RCLError is one
                 if rclpy.ok():
                     raise
-                return  # it was interrupted meanwhile; to ask before publishing would cost time
+                return  # the node was interrupted; to ask before publishing would cost time
             published = time.monotonic_ns()
         if turn is not None:
             turn.done(key)
@@ -242,7 +249,7 @@ class Shaping:
         self._readiness.ask_for()
         self._note(outcome, published, stalled)
         if not self._shaper.queue.waiting:
-            gc.collect()  # here is time for it; all that is older is frozen
+            gc.collect()  # there is time for it now; older objects are frozen
 
     def _in_order(self, outcome: Outcome, turn: Turn) -> Outcome:
         """Drop the message if the standby has published one that waits behind it."""
@@ -263,7 +270,7 @@ class Shaping:
 
     def _arrive(self, payload: bytes, info: dict[str, int], *, waited: bool) -> None:
         source, number = info.get("source_timestamp"), info.get("publication_sequence_number")
-        last, self._number, lost = self._number, number, None
+        last, self._last_number, lost = self._last_number, number, None
         if number is not None:  # a publisher that is started again counts anew
             lost = 0 if last is None else max(0, number - last - 1)
         now, overflowed = time.monotonic_ns(), self._shaper.overflowed
@@ -271,14 +278,14 @@ class Shaping:
         self._shaper.arrive(payload, now, source if waited else None, source, lost)
         if self._turn is None or len(overflowed) == before:
             return
-        gone = overflowed[-1].message.about
-        if self._turn.was_bypassed(gone):
+        key = overflowed[-1].message.about
+        if self._turn.was_bypassed(key):
             overflowed.pop()
         else:
-            self._turn.page.add("released", gone or 0)
+            self._turn.page.add("released", key or 0)
 
     def _look(self) -> None:
-        """Take all that has come."""
+        """Take all messages that have come."""
         handle = self._input.handle
         with handle:
             while (taken := handle.take_message(self._type, True)) is not None:

@@ -1,9 +1,9 @@
-// What the library in front of rmw has of ROS 2, for both its gates (`publisher_gate.cpp` and
+// What the library in front of rmw uses of ROS 2, for both its gates (`publisher_gate.cpp` and
 // `subscriber_gate.cpp`): structs of rmw, the functions behind ours, and the file of settings.
 //
 // Upstream: rmw, `rmw/types.h` and `rmw/rmw.h`, Humble to Rolling. The first fields of these
-// structs and the arguments of these functions are the same in all of them. Where ROS 2 is another
-// one, everything passes as if we were not here, and a line on stderr says so.
+// structs and the arguments of these functions are the same in all of these distributions. With any
+// other distribution or middleware the library shapes nothing, and a line on stderr says so.
 
 #pragma once
 
@@ -25,7 +25,7 @@
 
 #define EXPORTED extern "C" __attribute__((visibility("default")))
 
-// What we need of rmw's structs.
+// The parts of rmw's structs that the gates read or write.
 struct RmwNode {
   const char * implementation;
   void * data;
@@ -44,7 +44,7 @@ struct RmwQos {
   std::size_t depth;
   int reliability;
   int durability;
-  std::uint64_t others[16];  // more than any version has; 0: as usual
+  std::uint64_t others[16];  // more than any version has; 0: the default
 };
 enum { keep_last = 1, reliable = 1, best_available_reliability = 4 };
 enum { volatile_durability = 2, best_available_durability = 4 };
@@ -64,7 +64,7 @@ struct Bytes {  // rcutils_uint8_array_t
 };
 
 struct SubscriptionOptions {
-  void * room[16];  // returned by value: more than any version has
+  void * room[16];  // more than any version has: the struct is returned by value
 };
 
 struct MessageInfo {
@@ -72,7 +72,7 @@ struct MessageInfo {
   std::uint64_t others[31];       // more than any version has
 };
 
-// Of the functions behind ours, those that are called before ours of that name, or without one.
+// Functions of ROS 2 that the gates call, but for those that they define themselves further down.
 extern "C" {
 Allocator rcutils_get_default_allocator();
 const RmwPublisher * rcl_publisher_get_rmw_handle(const void * handle);
@@ -95,56 +95,68 @@ void say(const char * format, Values... values) {
   std::fprintf(stderr, line.c_str(), values...);
 }
 
-// The function behind ours. What Python's nodes load is in no scope of ours: rcl needs all of it.
+// Returns the function of that name in the libraries behind this one; null: there is none.
 void * behind(const char * name) {
-  if (void * const found = dlsym(RTLD_NEXT, name)) return found;
-  void * const loaded = dlopen("librcl.so", RTLD_LAZY | RTLD_NOLOAD);
-  return loaded == nullptr ? nullptr : dlsym(loaded, name);
+  if (void * const function = dlsym(RTLD_NEXT, name)) return function;
+  // Python's nodes load ROS 2 into a scope of their own, which rcl's library leads to.
+  void * const rcl = dlopen("librcl.so", RTLD_LAZY | RTLD_NOLOAD);
+  return rcl == nullptr ? nullptr : dlsym(rcl, name);
 }
 
-// The function of that name behind ours, which is there: `usable` has looked, or its caller has
-// linked to it.
-#define RMW(name)                                                               \
-  (*[] {                                                                        \
-    static const auto found = reinterpret_cast<decltype(&name)>(behind(#name)); \
-    return found;                                                               \
+// Returns that function where there must be one: `usable` has looked for it, or the caller of ours
+// is linked to it.
+template <typename Function>
+Function required_behind(const char * name) {
+  void * const function = behind(name);
+  if (function == nullptr) {
+    say("%s is not in this process's ROS 2", name);
+    std::abort();
+  }
+  return reinterpret_cast<Function>(function);
+}
+
+// Calls the function of that name behind ours: `RMW(rmw_publish)(publisher, …)`.
+#define RMW(name)                                                           \
+  (*[] {                                                                    \
+    static const auto function = required_behind<decltype(&(name))>(#name); \
+    return function;                                                        \
   }())
 
 [[maybe_unused]] bool is_humble() {
-  static const bool is = [] {  // asked for each message
+  static const bool humble = [] {  // the gates ask for each message
     const char * const distribution = std::getenv("ROS_DISTRO");
     return distribution != nullptr && std::strcmp(distribution, "humble") == 0;
   }();
-  return is;
+  return humble;
 }
 
-// Whether we know this ROS 2; said once where we do not.
+// Returns whether the gates know this distribution and middleware; says once that they do not.
 bool usable() {
-  static const bool known = [] {
+  static const bool is_known = [] {
     const char * const distribution = std::getenv("ROS_DISTRO");
     const auto is_one_of = [](const char * word, std::initializer_list<std::string> words) {
       return word != nullptr && std::find(words.begin(), words.end(), word) != words.end();
     };
     const bool has_rmw = behind("rmw_get_implementation_identifier") != nullptr;
     const char * const rmw = has_rmw ? RMW(rmw_get_implementation_identifier)() : "no rmw";
-    const bool all =
+    const bool are_known =
         is_one_of(distribution, {"humble", "jazzy", "kilted", "lyrical", "rolling"}) &&
         is_one_of(rmw, {"rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp",
                         "rmw_zenoh_cpp", "rmw_connextdds"});
-    if (!all)
+    if (!are_known)
       say("ROS 2 %s with %s is not known to the gate: outputs leave at once",
           distribution == nullptr ? "(no ROS_DISTRO)" : distribution, rmw);
-    return all;
+    return are_known;
   }();
-  return known;
+  return is_known;
 }
 
-// A block of the file that CHAINSHAPER_GATES names: each name with its values.
+// A block of lines of the file that CHAINSHAPER_GATES names: each name with its values.
 using Block = std::map<std::string, std::vector<std::string>>;
 
 std::string first_of(const Block & values, const char * name) {
-  const auto found = values.find(name);
-  return found == values.end() ? std::string() : found->second.front();
+  const auto entry = values.find(name);
+  return entry == values.end() ? std::string() : entry->second.front();
 }
 
 std::vector<Block> blocks_of(const std::string & path) {
@@ -160,15 +172,16 @@ std::vector<Block> blocks_of(const std::string & path) {
   return blocks;
 }
 
-// The block of an output that `wanted` agrees to, which is asked with it and the node's full name.
-template <typename Wanted>
-std::optional<Block> block_of(const std::string & topic, const RmwNode & node, Wanted wanted) {
+// Returns the first block of an output for which `applies` returns true, given the block and the
+// node's full name.
+template <typename Applies>
+std::optional<Block> block_of(const std::string & topic, const RmwNode & node, Applies applies) {
   const char * const path = std::getenv("CHAINSHAPER_GATES");
   if (path == nullptr) return std::nullopt;
-  const std::string within = node.name_space;
-  const std::string name = (within == "/" ? "" : within) + "/" + node.name;
+  const std::string name_space = node.name_space;
+  const std::string name = (name_space == "/" ? "" : name_space) + "/" + node.name;
   for (const auto & block : blocks_of(path))
-    if (first_of(block, "output") == topic && wanted(block, name)) return block;
+    if (first_of(block, "output") == topic && applies(block, name)) return block;
   return std::nullopt;
 }
 

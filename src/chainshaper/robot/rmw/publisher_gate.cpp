@@ -1,13 +1,16 @@
-// The gate in the process that publishes: `LD_PRELOAD` loads it into a node, where it stands before
-// rmw. What the node publishes on a shaped output is serialized and waits in a thread of this
+// The gate in the process that publishes: `LD_PRELOAD` loads it into a node, in front of rmw. It
+// serializes what the node publishes on a shaped output, and queues it for a thread of this
 // library, which sends it in the slots of the output's server. The node's executor goes on at once.
 //
-// CHAINSHAPER_GATES names a file with the outputs, a block of lines `NAME VALUE` each, which begins
-// with `output`: what ROS parameters say to a shaping node, and `node`, `input`, `publisher`,
-// `thread`.
+// CHAINSHAPER_GATES names a file with a block of lines `NAME VALUE` for each output, whose first
+// line is `output`. A block has the parameters of a shaping node, and:
 //
-// Tracers see what they would see of a shaping node (`node`): the node of the application publishes
-// on `input`, our thread takes that, as a callback of `node`, and publishes it on `output`.
+// * `publisher`: the full name of the node that publishes the output; none: any node.
+// * `thread`: the name of the thread that sends.
+// * `node`, `input`: names for tracers, which see what they would see of a shaping node: the node
+// of
+//   the application publishes on `input`; the thread takes that, as a callback of `node`, and
+//   publishes it on `output`.
 
 #include <link.h>
 #include <pthread.h>
@@ -16,6 +19,7 @@
 #include <memory>
 #include <new>
 #include <thread>
+#include <tuple>
 
 #include "chainshaper_shaping/gate_log.hpp"
 #include "chainshaper_shaping/handover.hpp"
@@ -25,7 +29,7 @@ namespace {
 
 using namespace chainshaper;  // NOLINT
 
-// Emits an event of ros2_tracing, whose arguments are all integers or pointers.
+// Emits an event of ros2_tracing; its arguments are integers and pointers.
 template <typename... Values>
 void emit(void * event, Values... values) {
   using Emit = void (*)(std::conditional_t<true, std::uintptr_t, Values>...);
@@ -37,7 +41,7 @@ void emit(void * event, Values... values) {
     emit(event, __VA_ARGS__);                               \
   } while (false)
 
-// `rmw_publish` as the distribution has it: from Jazzy on with publisher and time stamp.
+// Emits `rmw_publish` as the distribution declares it: from Jazzy on with publisher and time stamp.
 void emit_write(const void * publisher, const void * message, std::int64_t stamp) {
   if (is_humble())
     EMIT(rmw_publish, message);
@@ -45,6 +49,7 @@ void emit_write(const void * publisher, const void * message, std::int64_t stamp
     EMIT(rmw_publish, publisher, message, stamp);
 }
 
+// A serialized message, in a list of those that have arrived.
 class Serialized {
 public:
   Serialized() { bytes.allocator = RMW(rcutils_get_default_allocator)(); }
@@ -57,18 +62,21 @@ public:
   }
 
   Bytes bytes{};
-  std::int64_t stamp{0};       // CLOCK_REALTIME, when it was published
-  Serialized * next{nullptr};  // that came before
+  std::int64_t stamp{0};       // when the node published it (ns of CLOCK_REALTIME)
+  Serialized * next{nullptr};  // the message that arrived before it
 };
 using Message = std::unique_ptr<Serialized>;
 
+// The settings of an output.
 struct Settings {
   explicit Settings(const Block & values) {
-    output = first_of(values, "output"), input = first_of(values, "input");
-    node = first_of(values, "node"), thread = first_of(values, "thread");
+    output = first_of(values, "output");
+    input = first_of(values, "input");
+    node = first_of(values, "node");
+    thread = first_of(values, "thread");
     parameters.each([&](const char * name, auto & value) {
-      if (const auto found = values.find(name); found != values.end())
-        for (const auto & word : found->second) assign(value, word);
+      if (const auto entry = values.find(name); entry != values.end())
+        for (const auto & word : entry->second) assign(value, word);
     });
   }
 
@@ -83,7 +91,7 @@ struct Settings {
   Parameters parameters;
 };
 
-// The topic on which modes are announced, as the gate's thread reads it: a std_msgs/String.
+// The topic on which modes are announced (std_msgs/String), read by the gate's thread.
 class ModeTopic {
 public:
   ModeTopic(const RmwNode * node, const std::string & topic) {
@@ -104,18 +112,20 @@ public:
     if (subscription_ == nullptr) say("modes on %s cannot be read", topic.c_str());
   }
 
-  // The modes that were announced since the last time, each with the time (CLOCK_MONOTONIC).
-  template <typename Announced>
-  void read(Announced announced) {
+  // Calls `announce` with each mode that was announced since the last call, and the time of that
+  // (CLOCK_MONOTONIC).
+  template <typename Announce>
+  void read(Announce announce) {
     const auto take = RMW(rmw_take_serialized_message_with_info);
     while (subscription_ != nullptr) {
       Serialized text;
       MessageInfo info{};
       bool taken = false;
       if (take(subscription_, &text.bytes, &taken, &info, nullptr) != 0 || !taken) return;
-      const auto now = monotonic_ns(), sent = info.source_timestamp;
+      const auto now = monotonic_ns();
+      const auto sent = info.source_timestamp;  // 0: the middleware does not say
       const auto at = sent > 0 ? std::min(now, sent - clock_offset()) : now;
-      if (const auto mode = text_of(text.bytes.buffer, text.bytes.length)) announced(*mode, at);
+      if (const auto mode = text_of(text.bytes.buffer, text.bytes.length)) announce(*mode, at);
     }
   }
 
@@ -123,9 +133,10 @@ private:
   void * subscription_{nullptr};
 };
 
-struct Over {};  // the publisher is destroyed
+// Ends the gate's thread: the node destroys the publisher.
+struct PublisherDestroyed : std::exception {};
 
-// A publisher whose messages we send, with the thread that does it.
+// A publisher whose messages wait for slots, and the thread that sends them.
 class Output {
 public:
   Output(Settings settings, const RmwNode * node, const RmwPublisher * publisher,
@@ -137,7 +148,7 @@ public:
         shaper_(gate_of(settings_.parameters, depth), settings_.parameters.spin_ns) {
     const FileSizeSignalBlocked blocked;
     shaper_.look = [this] { look(); };
-    show();
+    share_page();
     const auto & parameters = settings_.parameters;
     if (!parameters.log.empty() && !log_.open_file(parameters.log, parameters.log_bytes))
       say("no log is written to %s: %s", parameters.log.c_str(), std::strerror(errno));
@@ -147,19 +158,20 @@ public:
   }
 
   ~Output() {
-    over_ = true;
+    is_destroyed_ = true;
     sem_post(&more_);
     thread_.join();
-    Message all(arrived_.exchange(nullptr));
-    std::size_t left = shaper_.queue.waiting.size();
-    for (; all; all.reset(all->next)) ++left;
-    if (left > 0)
+    Message arrived(arrived_.exchange(nullptr));
+    std::size_t unpublished = shaper_.queue.waiting.size();
+    for (; arrived; arrived.reset(arrived->next)) ++unpublished;
+    if (unpublished > 0)
       say("%s: its publisher has ended, messages that were not published: %zu",
-          settings_.output.c_str(), left);
+          settings_.output.c_str(), unpublished);
     sem_destroy(&more_);
   }
 
-  // Creation events: the application's node publishes on `input`, `node` takes that, and publishes.
+  // Emits the creation events of what tracers see: the application's node publishes on `input`;
+  // `node` takes that, and publishes on `output`.
   void describe(const void * rcl_publisher, const void * rcl_node, std::uintptr_t depth) {
     const char * const input = settings_.input.c_str();
     EMIT(rcl_node_init, &node_handle_, &rmw_node_, settings_.node.c_str(), "/");
@@ -176,14 +188,15 @@ public:
 
   const void * input_handle() const { return &input_handle_; }
 
-  // In the thread that publishes; it waits for nothing. `fill` serializes the message. rmw's code;
-  // none: the message is not taken, so that it is to be published at once.
+  // Queues a message, which `fill` serializes; called by the thread that publishes, which it never
+  // makes wait. Returns rmw's code; none: the message is not queued, and the caller publishes it at
+  // once.
   template <typename Fill>
   std::optional<int> take(const void * ros_message, Fill fill) {
-    if (failed_at_all_) return std::nullopt;
+    if (gate_failed_) return std::nullopt;
     Message message(new (std::nothrow) Serialized);
     if (!message) return std::nullopt;
-    // Where the event has no stamp, a message's publication is the last one before its stamp.
+    // On Humble the event has no stamp; a trace's reader takes the last event before the stamp.
     if (is_humble()) emit_write(&rmw_input_, ros_message, 0);
     message->stamp = next_stamp();
     if (!is_humble()) emit_write(&rmw_input_, ros_message, message->stamp);
@@ -192,7 +205,7 @@ public:
     newest->next = arrived_.load(std::memory_order_relaxed);
     while (!arrived_.compare_exchange_weak(newest->next, newest)) continue;
     sem_post(&more_);
-    if (failed_at_all_) publish_arrived();  // meanwhile
+    if (gate_failed_) publish_arrived();  // it failed meanwhile: no thread sends the message
     return 0;
   }
 
@@ -201,9 +214,10 @@ public:
   const void * rcl_publisher{nullptr};
 
 private:
-  // A page shows what becomes of the output; no standby looks at it. Cycles begin where they did
-  // for the process before this one, in its mode.
-  void show() {
+  // Opens the output's page, where `status` reads what becomes of messages, and through which the
+  // gate's schedule is changed; there is no standby. Phase and mode are taken over from the process
+  // before this one.
+  void share_page() {
     const auto & name = settings_.parameters.handover;
     if (name.empty()) return;
     try {
@@ -219,7 +233,7 @@ private:
     if (turn_) turn_->count(outcome);
   }
 
-  // Of CLOCK_REALTIME, and each once: it tells a message from the others.
+  // Returns the time (CLOCK_REALTIME), no time twice: the stamp tells a message from the others.
   std::int64_t next_stamp() {
     std::int64_t before = stamp_.load();
     std::int64_t now = 0;
@@ -238,21 +252,21 @@ private:
         if (shaper_.queue.waiting.empty())
           while (sem_wait(&more_) != 0) continue;  // a signal ended the wait early
         look();
-        for (const auto & gone : shaper_.overflowed) note(gone);
+        for (const auto & outcome : shaper_.overflowed) note(outcome);
         shaper_.overflowed.clear();
         if (!shaper_.queue.waiting.empty()) serve();
       }
-    } catch (const Over &) {
+    } catch (const PublisherDestroyed &) {
       return;
     } catch (const std::exception & error) {
-      failed_at_all_ = true;
+      gate_failed_ = true;
       say("%s: its gate has failed (%s): all that is published leaves at once from now on",
           settings_.output.c_str(), error.what());
       publish_all();
     }
   }
 
-  // What waits leaves at once, in its order.
+  // Publishes at once, in their order, all messages that wait.
   void publish_all() {
     for (const auto & waiting : shaper_.queue.waiting)
       if (waiting.message) publish(*waiting.message);
@@ -260,25 +274,27 @@ private:
     publish_arrived();
   }
 
-  void publish_arrived() {
-    std::vector<Message> newest_first;
+  // Takes the messages that have arrived; returns them in their order.
+  std::vector<Message> take_arrived() {
+    std::vector<Message> messages;
     for (auto * message = arrived_.exchange(nullptr); message != nullptr; message = message->next)
-      newest_first.emplace_back(message);
-    for (auto message = newest_first.rbegin(); message != newest_first.rend(); ++message)
-      publish(**message);
+      messages.emplace_back(message);
+    std::reverse(messages.begin(), messages.end());
+    return messages;
   }
 
+  void publish_arrived() {
+    for (const auto & message : take_arrived()) publish(*message);
+  }
+
+  // Hands the queue what has come since the last call. Throws PublisherDestroyed.
   void look() {
-    if (over_) throw Over();
+    if (is_destroyed_) throw PublisherDestroyed();
     read_modes();
-    std::vector<Message> all;  // the newest first
-    for (auto * one = arrived_.exchange(nullptr); one != nullptr; one = one->next)
-      all.emplace_back(one);
-    for (auto one = all.rbegin(); one != all.rend(); ++one) {
-      const auto & [bytes, stamp, next] = **one;
-      const auto origin = origin_of(bytes.buffer, bytes.length);
-      const auto source = stamp;
-      shaper_.arrive(std::move(*one), origin, source, true, 0);
+    for (auto & message : take_arrived()) {
+      const auto origin = origin_of(message->bytes.buffer, message->bytes.length);
+      const auto stamp = message->stamp;
+      shaper_.arrive(std::move(message), origin, stamp, true, 0);
     }
   }
 
@@ -291,6 +307,7 @@ private:
     });
   }
 
+  // Deals with the oldest message: waits for its slot and publishes it, or drops it.
   void serve() {
     const auto & oldest = shaper_.queue.waiting.front();
     EMIT(rmw_take, &rmw_subscription_, oldest.message.get(), oldest.message->stamp, true);
@@ -298,7 +315,8 @@ private:
     const auto key = oldest.message->stamp;
     if (turn_) turn_->take(key);
     const auto outcome = shaper_.hold();
-    Maybe published_ns, stalled_ns;
+    Maybe published_ns;
+    Maybe stalled_ns;
     if (outcome && outcome->release.at_ns) {
       publish(*outcome->waiting.message);
       published_ns = monotonic_ns();
@@ -318,20 +336,22 @@ private:
     // Before Jazzy rmw has no trace point on the way of serialized messages.
     if (is_humble()) emit_write(publisher, &message.bytes, 0);
     const int code = RMW(rmw_publish_serialized_message)(publisher, &message.bytes, nullptr);
-    if (code != 0 && !failed_) say("%s cannot be published: %d", settings_.output.c_str(), code);
-    failed_ = code != 0;
+    if (code != 0 && !publication_failed_)
+      say("%s cannot be published: %d", settings_.output.c_str(), code);
+    publication_failed_ = code != 0;
   }
 
   const Settings settings_;
   const RmwNode * node_;
-  // What traces call the things that are not there: addresses of their own.
-  char node_handle_, rmw_node_, input_handle_, rmw_input_, subscription_handle_, rmw_subscription_,
-      subscription_, callback_;
+  // Handles, for traces, of the shaping node and its endpoints, which do not exist: their
+  // addresses.
+  char node_handle_{}, rmw_node_{}, input_handle_{}, rmw_input_{}, subscription_handle_{},
+      rmw_subscription_{}, subscription_{}, callback_{};
   std::atomic<Serialized *> arrived_{nullptr};  // the newest first
   std::atomic<std::int64_t> stamp_{0};
-  std::atomic<bool> over_{false};
-  std::atomic<bool> failed_at_all_{false};  // the gate's thread has ended by an error
-  bool failed_{false};
+  std::atomic<bool> is_destroyed_{false};  // the publisher is destroyed
+  std::atomic<bool> gate_failed_{false};   // the gate's thread has ended by an error
+  bool publication_failed_{false};         // the last one
   sem_t more_{};
   std::optional<Turn> turn_;
   Shaper<Message> shaper_;
@@ -340,52 +360,71 @@ private:
   std::thread thread_;
 };
 
-// The outputs of this process, in the order of their making; room is given back, but never moved.
+// The outputs of this process, which this list owns. A free place is null; a place never moves.
 std::array<std::atomic<Output *>, 32> outputs;
 
-template <typename Is>
-Output * find_output(Is is) {
-  for (const auto & one : outputs)
-    if (Output * const output = one; output != nullptr && is(*output)) return output;
+template <typename Matches>
+Output * find_output(Matches matches) {
+  for (const auto & place : outputs)
+    if (Output * const output = place; output != nullptr && matches(*output)) return output;
   return nullptr;
 }
 
 Output * output_of(const RmwPublisher * publisher) {
-  return find_output([=](const Output & one) { return one.publisher == publisher; });
+  return find_output([=](const Output & output) { return output.publisher == publisher; });
 }
 
-// A child of fork() has none of our threads, so nothing of it is shaped.
+// Puts an output into the list; returns it where the list is full.
+std::unique_ptr<Output> insert(std::unique_ptr<Output> output) {
+  for (auto & place : outputs) {
+    Output * free_place = nullptr;
+    if (!place.compare_exchange_strong(free_place, output.get())) continue;
+    std::ignore = output.release();  // it is the list's now
+    return nullptr;
+  }
+  return output;
+}
+
+// Takes the output of a publisher out of the list; null: it has none.
+std::unique_ptr<Output> take_out(const RmwPublisher * publisher) {
+  for (auto & place : outputs) {
+    Output * output = place;
+    if (output == nullptr || output->publisher != publisher) continue;
+    if (place.compare_exchange_strong(output, nullptr)) return std::unique_ptr<Output>(output);
+  }
+  return nullptr;
+}
+
+// Shapes nothing in a child of fork(): it has no threads of this library.
 void in_child() {
-  for (auto & one : outputs) one = nullptr;
+  for (auto & place : outputs) place = nullptr;
 }
 
+// Makes the gate of a new publisher if the file of settings has one for it.
 void shape(const RmwNode * node, const RmwPublisher * publisher, const void * type_support,
            const RmwQos & qos) {
   if (node == nullptr || publisher == nullptr || publisher->topic == nullptr) return;
   try {
-    const auto block = block_of(publisher->topic, *node, [](const auto & one, const auto & name) {
-      const auto meant = first_of(one, "publisher");
-      return !first_of(one, "node").empty() && (meant.empty() || meant == name);
-    });
+    const auto block =
+        block_of(publisher->topic, *node, [](const Block & candidate, const std::string & name) {
+          const auto owner = first_of(candidate, "publisher");
+          return !first_of(candidate, "node").empty() && (owner.empty() || owner == name);
+        });
     if (!block || !usable()) return;
     const Settings settings(*block);
-    [[maybe_unused]] static const int once = pthread_atfork(nullptr, nullptr, in_child);
+    [[maybe_unused]] static const int registered = pthread_atfork(nullptr, nullptr, in_child);
     const auto depth = depth_of(settings.parameters, qos.depth);
     auto output = std::make_unique<Output>(settings, node, publisher, type_support, depth);
-    for (auto & one : outputs)
-      if (Output * none = nullptr; one.compare_exchange_strong(none, output.get())) {
-        output.release();
-        return;
-      }
-    say("%s: this process has too many shaped outputs: it leaves at once", publisher->topic);
+    if (insert(std::move(output)) != nullptr)
+      say("%s: this process has too many shaped outputs: it leaves at once", publisher->topic);
   } catch (const std::exception & error) {
     say("%s leaves at once: its gate in %s is wrong: %s", publisher->topic,
         std::getenv("CHAINSHAPER_GATES"), error.what());
   }
 }
 
-// As the C library of 2.35 and later has it in <dlfcn.h>.
-struct FoundObject {
+// `struct dl_find_object` of <dlfcn.h>, which the C library has from 2.35 on.
+struct LoadedObject {
   unsigned long long flags;  // NOLINT - the C library's
   void * start;
   void * end;
@@ -393,25 +432,26 @@ struct FoundObject {
   void * others[16];
 };
 
-// What making a mutex needs of the loader. It is asked as we are loaded: later it may have locks
-// taken for whose end a thread must not wait that makes a mutex.
+// The functions of the loader that the making of a mutex needs. They are looked up while this
+// library is loaded: later, the loader may hold locks for which a thread that makes a mutex must
+// not wait.
 struct Loader {
   decltype(&pthread_mutex_init) mutex_init{
       reinterpret_cast<decltype(&pthread_mutex_init)>(dlsym(RTLD_NEXT, "pthread_mutex_init"))};
-  int (*find_object)(void *, FoundObject *){
-      reinterpret_cast<int (*)(void *, FoundObject *)>(dlsym(RTLD_DEFAULT, "_dl_find_object"))};
+  int (*find_object)(void *, LoadedObject *){
+      reinterpret_cast<int (*)(void *, LoadedObject *)>(dlsym(RTLD_DEFAULT, "_dl_find_object"))};
 };
 
-const Loader & loader() {
-  static const Loader known;
-  return known;
+const Loader & loader() noexcept {
+  static const Loader functions;
+  return functions;
 }
 
 [[maybe_unused]] const Loader & at_loading = loader();
 
-// The file of the library that has code at an address; "": not known.
+// Returns the file of the library that has code at an address; "": not known.
 const char * library_of(void * address) {
-  FoundObject object{};
+  LoadedObject object{};
   if (loader().find_object != nullptr) {  // takes no lock
     const bool is_known = loader().find_object(address, &object) == 0;
     return is_known && object.loaded->l_name != nullptr ? object.loaded->l_name : "";
@@ -431,6 +471,9 @@ bool is_of_middleware(void * address) {
 
 }  // namespace
 
+// The signatures of these functions are those of ROS 2 and the C library:
+// NOLINTBEGIN(misc-const-correctness)
+
 EXPORTED RmwPublisher * rmw_create_publisher(const RmwNode * node, const void * type_support,
                                              const char * topic, const RmwQos * qos,
                                              const void * options) {
@@ -440,10 +483,7 @@ EXPORTED RmwPublisher * rmw_create_publisher(const RmwNode * node, const void * 
 }
 
 EXPORTED int rmw_destroy_publisher(RmwNode * node, RmwPublisher * publisher) {
-  Output * const output = output_of(publisher);
-  for (auto & one : outputs)
-    if (output != nullptr && one == output) one = nullptr;
-  delete output;
+  take_out(publisher).reset();  // its thread ends before its publisher
   return RMW(rmw_destroy_publisher)(node, publisher);
 }
 
@@ -473,18 +513,16 @@ EXPORTED int rmw_publish_serialized_message(const RmwPublisher * publisher, cons
   return RMW(rmw_publish_serialized_message)(publisher, message, allocation);
 }
 
-// A loaned message leaves as it is: it cannot wait without a copy. rclcpp asks before it borrows
-// one, and where the answer is no it publishes from memory of its own, which is shaped like any
-// other.
+// A loaned message cannot wait without a copy. rclcpp asks before it borrows one; where the answer
+// is no it publishes from its own memory, which is shaped as any other message.
 EXPORTED bool rcl_publisher_can_loan_messages(const void * handle) {
-  static std::atomic<bool> said;
+  static std::atomic<bool> is_reported;
   if (!RMW(rcl_publisher_can_loan_messages)(handle)) return false;
   const auto * const publisher = RMW(rcl_publisher_get_rmw_handle)(handle);
   if (output_of(publisher) == nullptr) return true;
-  if (!said.exchange(true))
+  if (!is_reported.exchange(true))
     say("%s: no messages are loaned: they cannot wait for their slot without a copy, so the node's "
-        "own"
-        " memory is used; plan with --publication synchronous to have loans",
+        "own memory is used; plan with --publication synchronous to have loans",
         publisher->topic);
   return false;
 }
@@ -495,7 +533,7 @@ EXPORTED int rmw_borrow_loaned_message(const RmwPublisher * publisher, const voi
   return RMW(rmw_borrow_loaned_message)(publisher, type_support, message);
 }
 
-// Called by rcl for each publisher, behind rmw_create_publisher.
+// rcl calls this for each publisher after rmw_create_publisher.
 EXPORTED void ros_trace_rcl_publisher_init(const void * handle, const void * node,
                                            const void * rmw_publisher, const char * topic,
                                            std::uintptr_t depth) {
@@ -506,19 +544,19 @@ EXPORTED void ros_trace_rcl_publisher_init(const void * handle, const void * nod
 }
 
 EXPORTED void ros_trace_rcl_publish(const void * handle, const void * message) {
-  const auto is = [=](const Output & one) { return one.rcl_publisher == handle; };
-  const Output * const output = find_output(is);
+  const auto publishes = [=](const Output & output) { return output.rcl_publisher == handle; };
+  const Output * const output = find_output(publishes);
   EMIT(rcl_publish, output == nullptr ? handle : output->input_handle(), message);
 }
 
-// A thread of real-time priority that waits for a mutex hands its priority on to the thread that
-// has it, as does the kernel for what is `PTHREAD_PRIO_INHERIT`: else an ordinary thread of the
-// process which loses its core within DDS keeps the chain's threads and the gate's waiting until it
-// has one again. Each call into Cyclone DDS takes a mutex that all threads share
-// (`dds_handle_pin`).
+// Gives the middleware's mutexes priority inheritance (`PTHREAD_PRIO_INHERIT`): a thread of
+// real-time priority that waits for such a mutex hands its priority on to the thread that has it.
+// Otherwise an ordinary thread of the process that loses its core within DDS makes the chain's
+// threads and the gate's wait until it has a core again. Each call into Cyclone DDS takes a mutex
+// that all threads share (`dds_handle_pin`).
 //
-// Only mutexes that the middleware makes are changed. One with priority inheritance may be unlocked
-// by the thread only that has locked it, which a robot's own code need not keep to.
+// Other mutexes stay as they are: only the thread that has locked a mutex with priority inheritance
+// may unlock it, and a robot's own code need not obey that.
 EXPORTED int pthread_mutex_init(pthread_mutex_t * mutex, const pthread_mutexattr_t * given) {
   const auto init = loader().mutex_init;
   if (!is_of_middleware(__builtin_return_address(0))) return init(mutex, given);
@@ -534,3 +572,5 @@ EXPORTED int pthread_mutex_init(pthread_mutex_t * mutex, const pthread_mutexattr
     pthread_mutexattr_setprotocol(&attributes, PTHREAD_PRIO_INHERIT);
   return init(mutex, &attributes) == 0 ? 0 : init(mutex, given);
 }
+
+// NOLINTEND(misc-const-correctness)

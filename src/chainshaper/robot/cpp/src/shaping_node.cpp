@@ -1,9 +1,15 @@
-// The latency-shaping node: what it receives on `input` it republishes on `output` in the slots of
-// its server (Managing End-to-End Timing Jitters in ROS2 Computation Chains, section 3.2.2), as
-// chainshaper's Python node, which explains it. One source for three packages: with `message.hpp`
-// it is for that type of message, without it for any, byte for byte. With CHAINSHAPER_COMPONENT it
-// is a component for that type: in the publisher's container it takes the publisher's own message,
-// and publishes that very one. The container's executor has the services of its node only.
+// The latency-shaping node: it republishes on `output`, in the slots of its server, what it
+// receives on `input` (Managing End-to-End Timing Jitters in ROS2 Computation Chains,
+// section 3.2.2). chainshaper's Python node does the same, and explains it.
+//
+// This source is built in three ways:
+//
+// * Without `message.hpp`: a node for messages of any type, passed on byte for byte.
+// * With it: a node for that type.
+// * With CHAINSHAPER_COMPONENT too: a component for that type. In the publisher's container it
+// takes
+//   the publisher's own message, without a copy, and publishes that very message. The container's
+//   executor serves its parameters only: the gate has a thread and an executor of its own.
 
 #include <dlfcn.h>
 
@@ -26,14 +32,14 @@ namespace {
 using chainshaper::Message;
 using Publisher = rclcpp::Publisher<Message>;
 using Input = rclcpp::Subscription<Message>;
-constexpr bool input_tells_takes = false;  // where a callback is executed
+constexpr bool input_tells_takes = false;  // the execution of a callback emits no take
 #ifdef CHAINSHAPER_COMPONENT
 using Pointer = std::unique_ptr<Message>;
 #else
 using Pointer = std::shared_ptr<Message>;
 #endif
 
-// The stamp of a message's header; none if it is zero, or the type has no header.
+// Returns the stamp of a message's header; none if it is zero, or the type has no header.
 template <typename T>
 auto stamp_of(const T & message, int)
     -> decltype(message.header.stamp.nanosec, chainshaper::Maybe()) {
@@ -60,35 +66,40 @@ auto subscribe(rclcpp::Node & node, const std::string &, const rclcpp::QoS & qos
   return node.create_subscription<Message>("input", qos, taken, options);
 }
 
-// What a publisher of this process sent to subscribers of others as well, the executor leaves out.
-struct Open : Input {
+// Gives access to a protected function of rclcpp's subscription.
+struct OpenSubscription : Input {
   using Input::matches_any_intra_process_publishers;
 };
 
+// Takes the next message that came by DDS. A message of a publisher in this process comes twice
+// where other processes subscribe too; the second is left out, as rclcpp's executor does.
 bool take(Input & input, Message & message, rclcpp::MessageInfo & info) {
   while (input.take(message, info)) {
     const auto & sender = info.get_rmw_message_info().publisher_gid;
-    if (!(input.*&Open::matches_any_intra_process_publishers)(&sender)) return true;
+    if (!(input.*&OpenSubscription::matches_any_intra_process_publishers)(&sender)) return true;
   }
   return false;
 }
 
-// What a ring buffer of rclcpp gives its subscription.
-using Within = std::pair<std::shared_ptr<const Message>, Pointer>;
+// What a subscription of rclcpp takes of its buffer of messages from the same process.
+using IntraProcessData = std::pair<std::shared_ptr<const Message>, Pointer>;
 
-// The oldest message that came without DDS, which only a component's may, or none.
-Pointer take_within(Input & input) {
+// Takes the oldest message of the same process, which came without DDS; null: there is none. Only a
+// component gets such messages.
+Pointer take_intra_process(Input & input) {
   const auto waitable = input.get_intra_process_waitable();
   const auto data = waitable ? waitable->take_data() : nullptr;
-  return data ? std::move(std::static_pointer_cast<Within>(data)->second) : nullptr;
+  return data ? std::move(std::static_pointer_cast<IntraProcessData>(data)->second) : nullptr;
 }
 
-// The callback has its message already, so it is given none, or an empty one.
-void execute(Input & input, const Pointer &, bool within, const rclcpp::MessageInfo & info) {
-  std::shared_ptr<void> nothing = std::make_shared<Within>();
-  if (within) return input.get_intra_process_waitable()->execute(nothing);
-  nothing = std::make_shared<Message>();
-  input.handle_message(nothing, info);
+// Executes the subscription's callback. `Shaping` has the message already, so the callback gets
+// none, or an empty one.
+void execute(Input & input, const Pointer &, bool is_intra_process,
+             const rclcpp::MessageInfo & info) {
+  std::shared_ptr<void> placeholder = std::make_shared<IntraProcessData>();
+  if (is_intra_process) return input.get_intra_process_waitable()->execute(placeholder);
+  placeholder = std::make_shared<Message>();
+  input.handle_message(placeholder, info);
 }
 
 #ifdef CHAINSHAPER_COMPONENT
@@ -118,15 +129,15 @@ auto make_publisher(rclcpp::Node & node, const std::string & type, const rclcpp:
 }
 
 auto subscribe(rclcpp::Node & node, const std::string & type, const rclcpp::QoS & qos,
-               const rclcpp::SubscriptionOptions &, chainshaper::Taken taken) {
-  return chainshaper::subscribe_serialized(node, "input", type, qos, std::move(taken));
+               const rclcpp::SubscriptionOptions &, const chainshaper::Taken & taken) {
+  return chainshaper::subscribe_serialized(node, "input", type, qos, taken);
 }
 
 bool take(Input & input, Message & message, rclcpp::MessageInfo & info) {
   return input.take_serialized(message, info);
 }
 
-Pointer take_within(Input &) { return nullptr; }
+Pointer take_intra_process(Input &) { return nullptr; }
 
 void execute(Input & input, const Pointer & message, bool, const rclcpp::MessageInfo & info) {
   input.handle_serialized_message(message, info);
@@ -143,21 +154,25 @@ namespace {
 
 using namespace chainshaper;  // NOLINT
 
-// Where DDS threads deliver the output: the first core that is ours to use and has no server. Those
-// of Fast DDS on Humble have no names, so no priority, and would wait while the core is cleared.
-Maybe delivery_core(const std::vector<std::int64_t> & taken) {
+// Returns the core where DDS threads deliver the output: the first one that this process may use
+// and that has no server. None with Fast DDS on Humble: its threads have no names, so they get no
+// priority, and would wait while the core is cleared.
+Maybe delivery_core(const std::vector<std::int64_t> & server_cores) {
 #if !RCLCPP_VERSION_GTE(17, 0, 0)  // Humble
   if (std::strncmp(rmw_get_implementation_identifier(), "rmw_fastrtps", 12) == 0)
     return std::nullopt;
 #endif
-  cpu_set_t ours;
-  if (taken.empty() || sched_getaffinity(0, sizeof(ours), &ours) != 0) return std::nullopt;
+  cpu_set_t usable;
+  if (server_cores.empty() || sched_getaffinity(0, sizeof(usable), &usable) != 0)
+    return std::nullopt;
   for (std::int64_t core = 0; core < CPU_SETSIZE; ++core)
-    if (CPU_ISSET(static_cast<std::size_t>(core), &ours) && !place_of(taken, core)) return core;
+    if (CPU_ISSET(static_cast<std::size_t>(core), &usable) && !place_of(server_cores, core))
+      return core;
   return std::nullopt;
 }
 
-// What is agreed with the standby; none: the node is alone, since nothing names a page.
+// Returns what the node agrees with its standby; none: it has no standby, so no parameter names a
+// page. Waits where the node has failed at once several times.
 std::optional<Turn> turn_of(rclcpp::Node & node) {
   const auto page = parameters_of(node).handover;
   if (page.empty()) return std::nullopt;
@@ -165,7 +180,7 @@ std::optional<Turn> turn_of(rclcpp::Node & node) {
   try {
     const auto topic = node.get_node_topics_interface()->resolve_topic_name("output");
     turn.emplace(page, topic, page_folders(), unloaded != nullptr);
-  } catch (const std::runtime_error & error) {  // the standby has none either
+  } catch (const std::runtime_error & error) {  // the standby has no page either
     RCLCPP_ERROR(node.get_logger(),
                  "nothing can be agreed with the standby, which does nothing: %s", error.what());
     return std::nullopt;
@@ -187,21 +202,22 @@ void take_again(const rclcpp::SubscriptionBase & subscription, const void * mess
   if (emit != nullptr) emit(handle, message, source_timestamp.value_or(0), true);
 }
 
+// Returns a QoS whose history has room for that many messages.
 rclcpp::QoS deeper(rclcpp::QoS qos, std::size_t depth) {
   if (qos.history() == rclcpp::HistoryPolicy::KeepLast) qos.keep_last(std::max(depth, qos.depth()));
   return qos;
 }
 
-// By what the standby and the log's readers know a message; one that came without DDS has no stamp.
-std::int64_t key_of(const Waiting<Pointer> & one) {
-  return one.source_timestamp.value_or(one.arrival_ns);
+// Returns the number by which the standby knows a message; one that came without DDS has no stamp.
+std::int64_t key_of(const Waiting<Pointer> & message) {
+  return message.source_timestamp.value_or(message.arrival_ns);
 }
 
-// The gate of a node, with its endpoints, which are in the group if one is given, and its log.
+// The gate of a node, with its endpoints (in the callback group, if one is given) and its log.
 class Shaping {
 public:
   Shaping(rclcpp::Node & node, const Offer & offer, std::optional<Turn> turn,
-          rclcpp::CallbackGroup::SharedPtr group = nullptr)
+          const rclcpp::CallbackGroup::SharedPtr & group = nullptr)
       : node_(node),
         parameters_(parameters_of(node)),
         turn_(std::move(turn)),
@@ -215,9 +231,10 @@ public:
     if (!log.empty() && !log_.open_file(log, parameters_.log_bytes))
       RCLCPP_WARN(node.get_logger(), "no log is written to %s: %s", log.c_str(),
                   std::strerror(errno));
-    phase_ =
+    phase_callback_ =
         node.add_on_set_parameters_callback([this](const std::vector<rclcpp::Parameter> & changed) {
-          const std::lock_guard<std::mutex> locked(asking_);  // the executor may be another one
+          // In a component, the container's executor calls this from another thread.
+          const std::lock_guard<std::mutex> locked(phase_mutex_);
           for (const auto & parameter : changed)
             if (parameter.get_name() == "phase_ns")
               asked_phase_.emplace(parameter.as_int(), monotonic_ns());
@@ -226,19 +243,20 @@ public:
           return result;
         });
     const auto depth = shaper_.queue.gate.depth;
-    const auto most = std::max<std::size_t>(depth, schema::reader_depth);
+    const auto input_depth = std::max<std::size_t>(depth, schema::reader_depth);
     const bool latched = offer.publisher.durability() == rclcpp::DurabilityPolicy::TransientLocal;
     output_ = make_publisher(node, offer.type,
                              latched ? offer.publisher : deeper(offer.publisher, depth));
     options_.callback_group = group;
     listen_to_modes();
-    input_ = subscribe(node, offer.type, deeper(offer.subscription, most), options_,
+    input_ = subscribe(node, offer.type, deeper(offer.subscription, input_depth), options_,
                        [this](Pointer message, const rclcpp::MessageInfo & info) {
                          shape(std::move(message), info);
                        });
   }
 
-  // Leave the output to the standby until the receivers know this node too. Whether it is to run.
+  // Leaves the output to the standby until the receivers know this node too; returns whether the
+  // node goes on.
   bool await_receivers() {
     const auto topic = node_.get_node_topics_interface()->resolve_topic_name("output");
     const auto give_up = monotonic_ns() + 2'000'000'000;
@@ -249,28 +267,31 @@ public:
     return goes_on();
   }
 
-  // Deal with what waits at the gate; whether some are left. Where nothing says which message of a
-  // buffer a callback has, but that it was the last one taken, the executor takes none meanwhile.
+  // Deals with the messages that wait at the gate, until there is time for the node's other
+  // callbacks; returns whether some are left. A trace says of a message of the same process only
+  // that a callback has the last one that was taken: while one waits, no other is taken.
   bool work_off() {
     for (bool served = false; goes_on(); served = true) {
-      for (const auto & gone : shaper_.overflowed) note(gone);
+      for (const auto & outcome : shaper_.overflowed) note(outcome);
       shaper_.overflowed.clear();
-      if (shaper_.queue.waiting.empty() || (served && !ahead_ && shaper_.nothing_due())) break;
+      if (shaper_.queue.waiting.empty() ||
+          (served && !intra_process_waits_ && shaper_.nothing_due()))
+        break;
       const auto & oldest = shaper_.queue.waiting.front();
-      const bool within = !oldest.source_timestamp;
+      const bool is_intra_process = !oldest.source_timestamp;
       auto info = rclcpp::MessageInfo();
       info.get_rmw_message_info().source_timestamp = oldest.source_timestamp.value_or(0);
-      if (!within && !input_tells_takes)
+      if (!is_intra_process && !input_tells_takes)
         take_again(*input_, oldest.message.get(), oldest.source_timestamp);
       its_turn_ = true;
-      execute(*input_, oldest.message, within, info);
+      execute(*input_, oldest.message, is_intra_process, info);
       its_turn_ = false;
     }
     return !shaper_.queue.waiting.empty();
   }
 
 private:
-  // To be called when discovery has had its time.
+  // Subscribes to the topic of modes. To be called when discovery knows its publishers.
   void listen_to_modes() {
     const auto & topic = parameters_.mode_topic;
     if (topic.empty()) return;
@@ -280,7 +301,7 @@ private:
         qos.transient_local();
     modes_ = node_.create_subscription<std_msgs::msg::String>(
         topic, qos,
-        [this](std::shared_ptr<const std_msgs::msg::String> mode) {
+        [this](const std::shared_ptr<const std_msgs::msg::String> & mode) {
           if (shaper_.announce(mode->data, monotonic_ns()))
             RCLCPP_INFO(node_.get_logger(), "mode %s", mode->data.c_str());
           else
@@ -291,12 +312,12 @@ private:
 
   // The subscription's callback.
   void shape(Pointer message, const rclcpp::MessageInfo & info) {
-    if (!its_turn_) {  // the executor took it
-      const bool alone = shaper_.queue.waiting.empty();
+    if (!its_turn_) {  // the executor took the message
+      const bool is_alone = shaper_.queue.waiting.empty();
       arrive(std::move(message), info.get_rmw_message_info(), false);
-      if (!alone) return;
+      if (!is_alone) return;
     }
-    ahead_ = false;
+    intra_process_waits_ = false;
     const auto key = key_of(shaper_.queue.waiting.front());
     if (turn_ && !turn_->take(key)) {
       shaper_.queue.leave({}, monotonic_ns());
@@ -310,13 +331,14 @@ private:
           return turn_->is_overtaken_by(key_of(waiting));
         }))
       outcome->release.drop(Dropped::replaced);
-    Maybe published_ns, stalled_ns;
+    Maybe published_ns;
+    Maybe stalled_ns;
     if (outcome->release.at_ns) {
       try {
         publish(*output_, outcome->waiting.message);
       } catch (const rclcpp::exceptions::RCLError &) {
         if (rclcpp::ok()) throw;
-        return;  // it was interrupted meanwhile; to ask before publishing would cost time
+        return;  // the node was interrupted meanwhile; to ask before publishing would cost time
       }
       published_ns = monotonic_ns();
     }
@@ -329,56 +351,64 @@ private:
     note(*outcome, published_ns, stalled_ns);
   }
 
-  // Take all that has come, but of what came without DDS one message only: see `work_off`.
+  // Takes all messages that have come; of those of the same process one only: see `work_off`.
   void look() {
     rclcpp::MessageInfo info;
-    for (Pointer message(new Message); take(*input_, *message, info); message.reset(new Message))
-      arrive(std::move(message), info.get_rmw_message_info(), true);
-    auto message = ahead_ ? nullptr : take_within(*input_);
+    for (;;) {
+      Pointer taken = std::make_unique<Message>();
+      if (!take(*input_, *taken, info)) break;
+      arrive(std::move(taken), info.get_rmw_message_info(), true);
+    }
+    auto message = intra_process_waits_ ? nullptr : take_intra_process(*input_);
     if (!message) return;
-    ahead_ = true;
+    intra_process_waits_ = true;
     info.get_rmw_message_info().from_intra_process = true;
     arrive(std::move(message), info.get_rmw_message_info(), true);
   }
 
+  // Queues a message; one that `waited` in the reader came before now.
   void arrive(Pointer message, const rmw_message_info_t & info, bool waited) {
     const auto stamp = stamp_of(*message, 0);
-    const bool within = info.from_intra_process;  // without anything else of DDS
-    if (const std::unique_lock<std::mutex> ours(asking_, std::try_to_lock); ours && asked_phase_) {
+    const bool is_intra_process = info.from_intra_process;  // the rest of `info` is empty then
+    if (const std::unique_lock<std::mutex> locked(phase_mutex_, std::try_to_lock);
+        locked && asked_phase_) {
       shaper_.queue.set_phase(asked_phase_->first, asked_phase_->second);
       asked_phase_.reset();
     }
     const auto before = shaper_.overflowed.size();
-    shaper_.arrive(std::move(message), stamp, within ? Maybe() : Maybe(info.source_timestamp),
-                   waited, within ? Maybe() : missing_before(info));
+    shaper_.arrive(std::move(message), stamp,
+                   is_intra_process ? Maybe() : Maybe(info.source_timestamp), waited,
+                   is_intra_process ? Maybe() : missing_before(info));
     if (!turn_ || shaper_.overflowed.size() == before) return;
-    const auto gone = key_of(shaper_.overflowed.back().waiting);
-    if (turn_->was_bypassed(gone))
+    const auto overflowed = key_of(shaper_.overflowed.back().waiting);
+    if (turn_->was_bypassed(overflowed))
       shaper_.overflowed.pop_back();
     else
-      turn_->drop(gone);
+      turn_->drop(overflowed);
   }
 
-  // How many messages are missing before this one, by its publisher's numbers; none: not known.
+  // Returns how many messages are missing before this one, by its publisher's numbers; none: not
+  // known.
   Maybe missing_before(const rmw_message_info_t & info) {
     if (info.publication_sequence_number == RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED)
       return std::nullopt;
-    const auto last = number_;
-    number_ = static_cast<std::int64_t>(info.publication_sequence_number);
+    const auto last = last_number_;
+    last_number_ = static_cast<std::int64_t>(info.publication_sequence_number);
     // A publisher that is started again counts anew.
-    return last ? std::max<std::int64_t>(0, *number_ - *last - 1) : 0;
+    return last ? std::max<std::int64_t>(0, *last_number_ - *last - 1) : 0;
   }
 
-  // Losses are said when they happen, at most every ten seconds.
+  // Notes what became of a message, in the log and for the standby; warns of losses, at most every
+  // ten seconds.
   void note(const Outcome<Pointer> & outcome, Maybe published_ns = {}, Maybe stalled_ns = {}) {
     log_.write(shaper_.queue.gate, outcome, published_ns, stalled_ns);
     if (turn_) turn_->count(outcome);
     const std::int64_t now = monotonic_ns();
-    if (said_ns_ != 0 && now - said_ns_ < 10'000'000'000) return;
+    if (warned_ns_ != 0 && now - warned_ns_ < 10'000'000'000) return;
     const std::string losses = log_.losses();
-    if (losses == std::exchange(said_, losses)) return;
+    if (losses == std::exchange(reported_losses_, losses)) return;
     RCLCPP_WARN(node_.get_logger(), "of %zu messages so far: %s", log_.rows, losses.c_str());
-    said_ns_ = now;
+    warned_ns_ = now;
   }
 
   rclcpp::Node & node_;
@@ -390,14 +420,14 @@ private:
   GateLog log_;
   std::shared_ptr<Publisher> output_;
   std::shared_ptr<Input> input_;
-  bool its_turn_{false};  // of the oldest message
-  bool ahead_{false};     // one that came without DDS waits behind it
-  Maybe number_;          // its publisher's, of the last message
-  std::string said_;
-  std::int64_t said_ns_{0};
-  std::mutex asking_;
-  std::optional<std::pair<std::int64_t, std::int64_t>> asked_phase_;  // which, and when
-  rclcpp::node_interfaces::OnSetParametersCallbackHandle::SharedPtr phase_;
+  bool its_turn_{false};             // the callback is executed for the oldest message
+  bool intra_process_waits_{false};  // a message of the same process is behind the oldest one
+  Maybe last_number_;                // of the last message, which its publisher gave it
+  std::string reported_losses_;
+  std::int64_t warned_ns_{0};
+  std::mutex phase_mutex_;                                            // for the next member
+  std::optional<std::pair<std::int64_t, std::int64_t>> asked_phase_;  // the phase, and since when
+  rclcpp::node_interfaces::OnSetParametersCallbackHandle::SharedPtr phase_callback_;
   rclcpp::Subscription<std_msgs::msg::String>::SharedPtr modes_;
 };
 
@@ -405,23 +435,23 @@ private:
 
 #ifdef CHAINSHAPER_COMPONENT
 
-// Its class has the name of the package: a container may have one for each of several types.
+// The namespace is named after the package: a container may have a component for each of several
+// types.
 namespace CHAINSHAPER_COMPONENT {
 
-// What is loaded into a container. The gate waits in a thread of its own, as an executor of its
-// own.
+// The component. Its gate waits in a thread with an executor of its own.
 class ShapingNode {
 public:
   explicit ShapingNode(rclcpp::NodeOptions options)
       : node_(std::make_shared<rclcpp::Node>(
             "chainshaper_shaping", options.automatically_declare_parameters_from_overrides(true))),
         group_(node_->create_callback_group(rclcpp::CallbackGroupType::MutuallyExclusive, false)),
-        before_(threads()),
+        threads_before_(threads()),
         services_(node_->create_wall_timer(std::chrono::nanoseconds(0), [this] { name_thread(); })),
         thread_([this] { run(); }) {}
 
   ~ShapingNode() {
-    unloaded_ = true;
+    is_unloaded_ = true;
     executor_.cancel();
     thread_.join();
   }
@@ -429,23 +459,25 @@ public:
   auto get_node_base_interface() { return node_->get_node_base_interface(); }
 
 private:
+  // Returns the ids of this process's threads.
   static std::set<std::string> threads() {
-    std::set<std::string> found;
-    for (const auto & one : std::filesystem::directory_iterator("/proc/self/task"))
-      found.insert(one.path().filename());
-    return found;
+    std::set<std::string> ids;
+    for (const auto & thread : std::filesystem::directory_iterator("/proc/self/task"))
+      ids.insert(thread.path().filename());
+    return ids;
   }
 
-  // In the container's executor. One that it has started for this node alone gets a name of its
-  // own: an isolated container's threads are told apart by their order, as it had them without us.
+  // Names the thread of the container's executor, which calls this, if the container has started it
+  // for this node alone: chainshaper tells an isolated container's threads apart by their order,
+  // and leaves this one out.
   void name_thread() {
     services_->cancel();
-    if (before_.count(std::to_string(syscall(SYS_gettid))) == 0)
+    if (threads_before_.count(std::to_string(syscall(SYS_gettid))) == 0)
       pthread_setname_np(pthread_self(), "gate_services");
   }
 
   void run() {
-    unloaded = &unloaded_;
+    unloaded = &is_unloaded_;
     const FileSizeSignalBlocked blocked;  // the container is the robot's
     pthread_setname_np(pthread_self(), gate_thread_name(node_->get_name()).c_str());
     try {
@@ -461,11 +493,11 @@ private:
     }
   }
 
-  std::atomic<bool> unloaded_{false};
+  std::atomic<bool> is_unloaded_{false};
   rclcpp::Node::SharedPtr node_;
   rclcpp::CallbackGroup::SharedPtr group_;
   rclcpp::executors::SingleThreadedExecutor executor_;
-  std::set<std::string> before_;
+  std::set<std::string> threads_before_;  // when the component was made
   rclcpp::TimerBase::SharedPtr services_;
   std::thread thread_;
 };
@@ -478,8 +510,8 @@ RCLCPP_COMPONENTS_REGISTER_NODE(CHAINSHAPER_COMPONENT::ShapingNode)
 #else
 
 int main(int argc, char ** argv) {
-  std::signal(SIGXFSZ,
-              SIG_IGN);  // a log that may grow no further (`ulimit -f`) is no reason to end
+  // The node goes on without a log that may grow no further (`ulimit -f`).
+  std::signal(SIGXFSZ, SIG_IGN);
   std::optional<Shaping> shaping;
   return run(argc, argv, "chainshaper_shaping", [&](rclcpp::Node & node) -> std::function<bool()> {
     auto turn = turn_of(node);

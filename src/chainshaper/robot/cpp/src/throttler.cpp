@@ -12,6 +12,7 @@
 
 namespace {
 
+// A topic, and counts of what became of its messages.
 struct Channel {
   std::string output;
   rclcpp::GenericPublisher::SharedPtr publisher;
@@ -23,6 +24,7 @@ struct Channel {
   std::size_t dropped{0};
   std::size_t missing{0};
 
+  // Publishes the newest message that came since the last publication.
   void publish(rclcpp::Node & node) {
     if (newest) {
       chainshaper::publish_serialized(*publisher, *newest);
@@ -35,10 +37,11 @@ struct Channel {
                          "nothing new for %s; this is no. %zu", output.c_str(), missing);
   }
 
-  void take(rclcpp::Node & node, std::shared_ptr<const rclcpp::SerializedMessage> message) {
+  // Publishes a message if it is the first of its period; or keeps it until the next tick.
+  void take(rclcpp::Node & node, const std::shared_ptr<const rclcpp::SerializedMessage> & message) {
     const bool passes = !periods || periods->passes(chainshaper::monotonic_ns());
     dropped += newest || !passes ? 1 : 0;
-    newest = passes ? std::move(message) : nullptr;
+    newest = passes ? message : nullptr;
     if (passes && periods) publish(node);
   }
 };
@@ -52,8 +55,9 @@ int main(int argc, char ** argv) {
         const auto parameters = chainshaper::parameters_of(node);
         const auto & [inputs, outputs] = std::tie(parameters.inputs, parameters.outputs);
         const auto period = parameters.period_ns;
-        const bool first = parameters.rule == "first", known = first || parameters.rule == "newest";
-        if (inputs.empty() || inputs.size() != outputs.size() || period <= 0 || !known)
+        const bool is_first = parameters.rule == "first";
+        const bool is_known = is_first || parameters.rule == "newest";
+        if (inputs.empty() || inputs.size() != outputs.size() || period <= 0 || !is_known)
           throw std::invalid_argument("inputs, as many outputs, a period, and a rule are needed");
         for (std::size_t i = 0; i < inputs.size(); ++i) {
           const auto offer = chainshaper::wait_for_publisher(node, inputs[i]);
@@ -61,15 +65,15 @@ int main(int argc, char ** argv) {
           channels.push_back(std::make_unique<Channel>());
           Channel & channel = *channels.back();
           channel.output = outputs[i];
-          if (first) channel.periods = chainshaper::FirstOfPeriod{period};
+          if (is_first) channel.periods = chainshaper::FirstOfPeriod{period};
           channel.publisher =
               node.create_generic_publisher(outputs[i], offer->type, offer->publisher);
           channel.subscription = chainshaper::subscribe_serialized(
               node, inputs[i], offer->type, offer->subscription,
-              [&node, &channel](std::shared_ptr<rclcpp::SerializedMessage> message,
+              [&node, &channel](const std::shared_ptr<rclcpp::SerializedMessage> & message,
                                 const rclcpp::MessageInfo &) { channel.take(node, message); });
         }
-        if (first) return [] { return false; };
+        if (is_first) return [] { return false; };
         // A timer keeps the phase at which it was made, on the same clock.
         const std::int64_t since = chainshaper::monotonic_ns() - parameters.phase_ns;
         chainshaper::sleep_until(parameters.phase_ns + (since / period + 1) * period);

@@ -1,5 +1,5 @@
-// What a gate did, one line of comma-separated values per message, written by a thread of its own:
-// as GateLog of chainshaper's Python node, which says why. No ROS 2 here.
+// Writes a gate's log: a line of comma-separated values for each message, written by a thread that
+// does nothing else. GateLog of chainshaper's Python node is the same, and says why. No ROS 2 here.
 
 #pragma once
 
@@ -21,9 +21,9 @@
 
 namespace chainshaper {
 
-// Lines on their way from the gate's thread, which never waits, to the one that writes them. (A
-// pipe would do it too, but a process that closes all descriptors and uses the numbers again would
-// get our lines in files of its own.)
+// Lines on their way from the gate's thread, which never waits, to the thread that writes them. (A
+// pipe would do as well, but where the robot's process closes all descriptors and uses their
+// numbers again, the lines would end in files of the robot.)
 class LineQueue {
 public:
   LineQueue() { sem_init(&more_, 0, 0); }
@@ -33,7 +33,7 @@ public:
 
   ~LineQueue() { sem_destroy(&more_); }
 
-  // False: there is no room for the line.
+  // Adds a line; returns false if there is no room for it.
   bool put(std::string_view line) {
     const auto begin = put_.load(std::memory_order_relaxed);
     if (line.size() > room - (begin - taken_.load(std::memory_order_acquire))) return false;
@@ -44,15 +44,15 @@ public:
     return true;
   }
 
-  // No line comes any more.
+  // Says that no line comes any more.
   void end() {
     ended_ = true;
     sem_post(&more_);
   }
 
-  // Wait for lines and take some of them, one at least; false: there are none, and none come any
-  // more. Each line has its own post of the semaphore, so that those that are left are taken the
-  // next time.
+  // Waits for lines and takes some of them, one at least; returns false if there are none, and none
+  // come any more. `put` posts the semaphore for each line, so the next call takes those that are
+  // left.
   bool take(std::string & lines) {
     while (sem_wait(&more_) != 0) continue;  // a signal ended the wait early
     const bool is_last = ended_;
@@ -67,16 +67,17 @@ public:
 
 private:
   static constexpr std::size_t room = 1 << 20;
-  static constexpr std::size_t at_once =
-      4096;  // bytes: a file's bound holds for what is added, too
+  // Bytes that are taken at once: few, since what is added to a file counts for its bound.
+  static constexpr std::size_t at_once = 4096;
 
   std::unique_ptr<std::array<char, room>> bytes_{std::make_unique<std::array<char, room>>()};
-  std::atomic<std::size_t> put_{0};    // bytes so far
-  std::atomic<std::size_t> taken_{0};  // of these
+  std::atomic<std::size_t> put_{0};    // bytes that were put so far
+  std::atomic<std::size_t> taken_{0};  // bytes of these that were taken
   std::atomic<bool> ended_{false};
   sem_t more_{};
 };
 
+// The log of a gate, and the sums of what it lost.
 class GateLog {
 public:
   ~GateLog() {
@@ -85,20 +86,22 @@ public:
     writer_.join();
   }
 
-  // Lines are added to a file that is there; false (and errno): it cannot be written now. The file
-  // and the one before it, `….1`, have no more than `most_bytes`.
+  // Starts the thread that writes the file; lines are added to one that is there. Returns false
+  // (and errno) if the file cannot be written now. It and the one before it, `….1`, together have
+  // no more than `most_bytes`.
   bool open_file(const std::string & path, std::int64_t most_bytes) {
     path_ = path;
     most_bytes_ = most_bytes;
     const FileSizeSignalBlocked blocked;
     const bool opened = append("");
-    const int because = errno;
+    const int reason = errno;
     const SignalsBlocked inherited;
     writer_ = std::thread([this] { write_lines(); });
-    errno = because;
+    errno = reason;
     return opened;
   }
 
+  // Writes what became of a message, and counts what was lost.
   template <typename Message>
   void write(const Gate & gate, const Outcome<Message> & outcome, Maybe published_ns = {},
              Maybe stalled_ns = {}) {
@@ -117,15 +120,16 @@ public:
     if (!waiting_.put(line_)) ++unlogged;
   }
 
+  // Returns what was lost so far, in words; "": nothing.
   std::string losses() const {
-    std::string said;
-    const auto add = [&](std::size_t count, const char * why) {
-      if (count > 0) said += (said.empty() ? "" : ", ") + std::to_string(count) + " " + why;
+    std::string text;
+    const auto add = [&](std::size_t count, const char * reason) {
+      if (count > 0) text += (text.empty() ? "" : ", ") + std::to_string(count) + " " + reason;
     };
     for (std::size_t i = 0; i < dropped.size(); ++i) add(dropped[i], dropped_names[i]);
     add(lost_by_dds, "lost by DDS");
     add(unlogged, "not in the log");
-    return said;
+    return text;
   }
 
   std::size_t rows{0};
@@ -140,8 +144,9 @@ private:
       if (!lines.empty()) append(lines);
   }
 
-  // Adds whole lines only; what cannot be written is missing. A file that would have more than half
-  // of `most_bytes_` becomes `….1`; one that has been removed is made anew. Whether it is there.
+  // Adds whole lines to the file; returns whether it could be opened. Lines that cannot be written
+  // are missing. A file that would have more than half of `most_bytes_` becomes `….1`; one that has
+  // been removed is made anew.
   bool append(const std::string & lines) {
     // A link that another user has put there is not followed, nor anything but a file written to.
     const int flags = O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC | O_NONBLOCK | O_NOFOLLOW;
@@ -149,7 +154,7 @@ private:
     if (file < 0) return false;
     struct stat state{};
     if (fstat(file, &state) != 0 || state.st_nlink > 1 || state.st_uid != geteuid()) {
-      close(file);  // somebody else's was put in its place
+      close(file);  // another user has put a file in its place
       errno = EPERM;
       return false;
     }
@@ -173,8 +178,8 @@ private:
   }
 
   template <typename Words, typename Word>
-  static const char * word(const Words & words, const std::optional<Word> & one) {
-    return one ? words[static_cast<std::size_t>(*one)] : "";
+  static const char * word(const Words & words, const std::optional<Word> & value) {
+    return value ? words[static_cast<std::size_t>(*value)] : "";
   }
 
   template <typename... Values>

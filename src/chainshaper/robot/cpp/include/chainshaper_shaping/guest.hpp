@@ -1,5 +1,5 @@
-// What keeps a library of ours a good guest in a robot's process: whatever fails in it, the process
-// goes on as without it. No ROS 2 here.
+// Keeps a library of chainshaper a good guest in a robot's process: whatever fails in the library,
+// the process goes on as without it. No ROS 2 here.
 
 #pragma once
 
@@ -17,9 +17,9 @@
 
 namespace chainshaper {
 
-// Blocks SIGXFSZ in the calling thread while it lives, and takes back what came meanwhile: the
-// signal comes where a file would get larger than `ulimit -f` allows, and by default it ends the
-// process.
+// Blocks SIGXFSZ in the calling thread while it lives, and at its end discards such a signal that
+// has come: the kernel sends it where a file would get larger than `ulimit -f` allows, and by
+// default it ends the process.
 class FileSizeSignalBlocked {
 public:
   FileSizeSignalBlocked() {
@@ -49,8 +49,8 @@ private:
   bool was_pending_;
 };
 
-// Blocks all signals in the calling thread while it lives. Threads that it starts inherit that: a
-// signal of the robot's process is handled by a thread of the robot's.
+// Blocks all signals in the calling thread while it lives. Threads that are started meanwhile
+// inherit that: threads of the robot handle the signals of the robot's process.
 class SignalsBlocked {
 public:
   SignalsBlocked() {
@@ -68,8 +68,8 @@ private:
   sigset_t before_;
 };
 
-// An open file. A process may close all descriptors by their numbers and use these again, as
-// daemons do: so each use asks first whether the number is still this file's.
+// An open file. A process may close all descriptors by their numbers and use the numbers again, as
+// daemons do: call `is_open` before each use, which checks that the number is still this file's.
 class File {
 public:
   File() = default;
@@ -92,14 +92,14 @@ public:
   }
 
   bool is_open() const {
-    struct stat there{};
-    return number_ >= 0 && fstat(number_, &there) == 0 && is_same(there, identity_);
+    struct stat state{};
+    return number_ >= 0 && fstat(number_, &state) == 0 && is_same(state, identity_);
   }
 
-  // Whether that path still names this file, and it has at least so many bytes.
+  // Returns whether that path still names this file, and it has at least so many bytes.
   bool is_at(const std::string & path, off_t bytes) const {
-    struct stat there{};
-    return stat(path.c_str(), &there) == 0 && is_same(there, identity_) && there.st_size >= bytes;
+    struct stat state{};
+    return stat(path.c_str(), &state) == 0 && is_same(state, identity_) && state.st_size >= bytes;
   }
 
   const struct stat & identity() const { return identity_; }

@@ -1,6 +1,6 @@
-// What the shaping nodes and the throttler have in common on the side of ROS 2: parameters, the
-// quality of service of a topic's publisher, serialized messages, and real-time scheduling of the
-// calling thread. Written for Humble to Rolling; where they differ, it is said.
+// What the shaping nodes and the throttler share on the side of ROS 2: parameters, the quality of
+// service of a topic's publisher, serialized messages, and real-time scheduling of the calling
+// thread. For Humble to Rolling; comments name the distributions that differ.
 
 #pragma once
 
@@ -23,23 +23,26 @@
 
 namespace chainshaper {
 
+// Returns a node's parameters, with defaults for those that its file does not have.
 inline Parameters parameters_of(rclcpp::Node & node) {
-  Parameters found;
-  found.each([&](const char * name, auto & value) {
-    const auto otherwise = value;
-    node.get_parameter_or(name, value, otherwise);
+  Parameters parameters;
+  parameters.each([&](const char * name, auto & value) {
+    const auto default_value = value;
+    node.get_parameter_or(name, value, default_value);
   });
-  return found;
+  return parameters;
 }
 
-// A publisher as others know it, and the QoS with which to subscribe to it and to stand in for it.
+// A publisher as other nodes know it: its type, the QoS of a subscription to it, and the QoS of a
+// publisher in its place.
 struct Offer {
   std::string type;
   rclcpp::QoS subscription;
   rclcpp::QoS publisher;
 };
 
-// What discovery does not tell is taken to be as in `offered_by` of chainshaper's Python node.
+// Returns what a publisher offers. For what discovery does not tell, it assumes the same as
+// `offered_by` of chainshaper's Python node.
 inline Offer offer_of(const rclcpp::TopicEndpointInfo & info, std::size_t depth) {
   rmw_qos_profile_t offered = info.qos_profile().get_rmw_qos_profile();
   if (offered.history != RMW_QOS_POLICY_HISTORY_KEEP_ALL) {
@@ -58,24 +61,25 @@ inline Offer offer_of(const rclcpp::TopicEndpointInfo & info, std::size_t depth)
   return {info.topic_type(), asked, rclcpp::QoS(history, offered)};
 }
 
-// Set in the thread of a component, which is to stop when it is unloaded.
+// In the thread of a component: whether the component is unloaded, and the thread has to stop.
 inline thread_local const std::atomic<bool> * unloaded = nullptr;
 
 inline bool goes_on() { return rclcpp::ok() && (unloaded == nullptr || !*unloaded); }
 
-// What chainshaper knows the thread of a gate in another's process by (`gate_thread_name`).
+// Returns the name of a gate's thread in a process of the robot, by which chainshaper finds it
+// (`gate_thread_name` in Python).
 inline std::string gate_thread_name(const std::string & node) {
   std::uint32_t sum = ~0u;
   for (const char letter : node) {
     sum ^= static_cast<std::uint8_t>(letter);
     for (int bit = 0; bit < 8; ++bit) sum = (sum >> 1) ^ ((sum & 1) != 0 ? 0xEDB88320u : 0u);
   }
-  char text[16];
+  char text[16]{};
   std::snprintf(text, sizeof(text), "gate-%08x", ~sum);
   return text;
 }
 
-// Wait, unless the node is to stop; whether it goes on.
+// Waits, at most until the node has to stop; returns whether it goes on.
 inline bool wait(double seconds) {
   const auto until = monotonic_ns() + static_cast<std::int64_t>(seconds * 1e9);
   while (goes_on() && monotonic_ns() < until)
@@ -83,34 +87,35 @@ inline bool wait(double seconds) {
   return goes_on();
 }
 
-// Wait until a topic has a publisher; none when the node is to stop.
+// Waits until a topic has a publisher, and returns what that offers; none: the node has to stop.
 inline std::optional<Offer> wait_for_publisher(rclcpp::Node & node, const std::string & topic) {
   const auto depth = static_cast<std::size_t>(parameters_of(node).output_depth);
   const std::string name = node.get_node_topics_interface()->resolve_topic_name(topic);
-  for (bool said = false; goes_on(); said = true) {
-    const auto found = node.get_publishers_info_by_topic(topic);
-    if (!found.empty() && !found[0].topic_type().empty()) {
-      if (found.size() > 1)
+  for (bool is_reported = false; goes_on(); is_reported = true) {
+    const auto publishers = node.get_publishers_info_by_topic(topic);
+    if (!publishers.empty() && !publishers[0].topic_type().empty()) {
+      const auto & first = publishers[0];
+      if (publishers.size() > 1)
         RCLCPP_WARN(node.get_logger(), "%s has %zu publishers: the QoS of the first is copied",
-                    name.c_str(), found.size());
-      const Offer offer = offer_of(found[0], depth);
+                    name.c_str(), publishers.size());
+      Offer offer = offer_of(first, depth);
       RCLCPP_INFO(node.get_logger(), "%s is published by %s/%s as %s", name.c_str(),
-                  found[0].node_namespace() == "/" ? "" : found[0].node_namespace().c_str(),
-                  found[0].node_name().c_str(), offer.type.c_str());
+                  first.node_namespace() == "/" ? "" : first.node_namespace().c_str(),
+                  first.node_name().c_str(), offer.type.c_str());
       return offer;
     }
-    if (!said) RCLCPP_INFO(node.get_logger(), "waiting for a publisher of %s", name.c_str());
+    if (!is_reported) RCLCPP_INFO(node.get_logger(), "waiting for a publisher of %s", name.c_str());
     wait(0.01);
   }
   return std::nullopt;
 }
 
-// Give the calling thread its core and SCHED_FIFO priority, and lock the memory of a process that
-// is ours. To be called when all endpoints exist: threads inherit, and those of DDS must not; later
-// ones do not get the class.
+// Gives the calling thread its core and SCHED_FIFO priority; locks the memory, but not that of the
+// robot's process. To be called when all endpoints exist: new threads inherit the core, and threads
+// of DDS must not. (They do not inherit the priority.)
 inline void become_realtime(rclcpp::Node & node) {
-  const auto warn = [&](const std::string & what, const char * remedy) {
-    RCLCPP_WARN(node.get_logger(), "%s: %s; it works on without: %s", what.c_str(),
+  const auto warn = [&](const std::string & problem, const char * remedy) {
+    RCLCPP_WARN(node.get_logger(), "%s: %s; it works on without: %s", problem.c_str(),
                 std::strerror(errno), remedy);
   };
   if (unloaded == nullptr && mlockall(MCL_CURRENT | MCL_FUTURE) != 0)
@@ -118,16 +123,16 @@ inline void become_realtime(rclcpp::Node & node) {
   schedule(parameters_of(node), warn);
 }
 
-// Run a node until it is interrupted: `set_up` makes its endpoints and returns what is to be called
-// behind each callback, or nothing where it is not to run; that returns whether it wants to be
-// called again although nothing has come. The exit code of the process.
+// Runs a node until it is interrupted; returns the exit code of the process. `set_up` makes the
+// node's endpoints and returns a function, or nothing where the node has to stop. The function is
+// called behind each callback; it returns true to be called again before another message comes.
 template <typename SetUp>
 int run(int argc, char ** argv, const std::string & name, SetUp && set_up) {
-  // Ctrl-C reaches a node from its terminal, and then again from `ros2 launch`. When rclcpp has
-  // seen the first it gives the signal back, as it was before: ignored.
+  // Ctrl-C reaches a node from its terminal, and then again from `ros2 launch`. After the first one
+  // rclcpp restores what the signal did before: nothing.
   std::signal(SIGINT, SIG_IGN);
   rclcpp::init(argc, argv);
-  // Parameters come from the file only: what is in it, is declared.
+  // The file declares the parameters.
   const auto node = std::make_shared<rclcpp::Node>(
       name, rclcpp::NodeOptions().automatically_declare_parameters_from_overrides(true));
   int code = 0;
@@ -147,12 +152,12 @@ int run(int argc, char ** argv, const std::string & name, SetUp && set_up) {
   return code;
 }
 
-// Messages of any type, as they came from the wire: receiving them with their source timestamps,
-// and publishing them, so that a tracer sees both.
+// Serialized messages of any type: what follows receives them with their source timestamps, and
+// publishes them, so that a tracer sees both.
 //
-// From Jazzy on rclcpp's generic subscriptions and publishers do all that. Before, their callbacks
-// are given the message only (rclcpp issue 1604), and none of rclcpp, rcl and rmw has trace points
-// on the way of serialized messages: here they are passed what rclcpp knows, and emit the events
+// From Jazzy on rclcpp's generic subscriptions and publishers do all that. Before Jazzy, a callback
+// gets the message only (rclcpp issue 1604), and neither rclcpp nor rcl nor rmw has trace points on
+// the way of serialized messages: the code below passes on what rclcpp knows, and emits the events
 // that Jazzy has. Upstream: ros2_tracing, `tracetools/include/tracetools/tracetools.h`, 4.1.1.
 
 using Taken =
@@ -164,13 +169,13 @@ inline constexpr bool serialized_tells_takes = false;
 
 #else
 
-// Executing a callback emits the event of a take.
+// Whether the execution of a callback emits the event of a take.
 inline constexpr bool serialized_tells_takes = true;
 
 class SerializedSubscription : public rclcpp::GenericSubscription {
 public:
   SerializedSubscription(rclcpp::Node & node, const std::string & topic, const std::string & type,
-                         const rclcpp::QoS & qos, Taken taken)
+                         const rclcpp::QoS & qos, const Taken & taken)
       : GenericSubscription(
             node.get_node_base_interface().get(),
             rclcpp::get_typesupport_library(type, "rosidl_typesupport_cpp"), topic, type, qos,
@@ -203,7 +208,7 @@ inline rclcpp::GenericSubscription::SharedPtr subscribe_serialized(rclcpp::Node 
                                                                    const std::string & topic,
                                                                    const std::string & type,
                                                                    const rclcpp::QoS & qos,
-                                                                   Taken taken) {
+                                                                   const Taken & taken) {
 #if RCLCPP_VERSION_GTE(25, 0, 0)
   return node.create_generic_subscription(topic, type, qos, taken);
 #else

@@ -1,6 +1,7 @@
-// Making what follows a release take the same time in every cycle, as Readiness of chainshaper's
-// Python node, which says why: the publication is rehearsed, idle cores do not sleep, and the core
-// where the output is delivered is clear of other work (chainshaper/robot/clear_core.py).
+// Makes a publication take the same time in every cycle: it is rehearsed, idle cores do not sleep,
+// and the core where the output is delivered is clear of other work
+// (chainshaper/robot/clear_core.py). Readiness of chainshaper's Python node is the same, and says
+// why.
 
 #pragma once
 
@@ -17,7 +18,8 @@
 
 namespace chainshaper {
 
-// Where SCHED_FIFO or the core is refused, it is not clear.
+// Clears a core of ordinary threads: a thread of SCHED_FIFO 1 runs there while an output is
+// delivered. Where SCHED_FIFO or the core is refused, it does nothing.
 class ClearCore {
 public:
   explicit ClearCore(std::int64_t core) {
@@ -31,8 +33,8 @@ public:
     sem_destroy(&more_);
   }
 
-  void clear_until(std::int64_t time_ns) {
-    until_ns_ = time_ns;
+  void clear_until(std::int64_t until_ns) {
+    until_ns_ = until_ns;
     sem_post(&more_);
   }
 
@@ -49,7 +51,7 @@ private:
     }
   }
 
-  sem_t more_;
+  sem_t more_{};  // posted with each new time
   std::atomic<std::int64_t> until_ns_{0};
   std::thread thread_;
 };
@@ -59,7 +61,7 @@ public:
   // The core is where the output is delivered, for `pause_ns` after it was published.
   Readiness(rclcpp::Node & node, Maybe delivery_core, std::int64_t pause_ns)
       : pause_ns_(pause_ns),
-        rehearsal_(node.create_generic_publisher(  // of all shaping nodes; an underscore hides it
+        rehearsal_(node.create_generic_publisher(  // of all shaping nodes; the underscore hides it
             "/_chainshaper_rehearsal", "std_msgs/msg/Empty", rclcpp::QoS(1))),
         empty_(serialized_empty.size()),
         to_itself_(File(socket(AF_INET, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0))),
@@ -83,22 +85,24 @@ public:
                  connect(number, general, length) == 0;
   }
 
+  // Prepares a publication at that time: asks cores not to sleep, clears the core where the output
+  // is delivered, and rehearses the way of a message through DDS and the network.
   void get_ready(std::int64_t release_ns) {
     ask_for(0);
     if (delivery_core_) delivery_core_->clear_until(release_ns + pause_ns_);
-    for (int time = 0; time < 2; ++time) {  // the second finds in order what the first has loaded
+    for (int repetition = 0; repetition < 2; ++repetition) {  // the first loads caches
       if (monotonic_ns() > release_ns - rehearsal_ns) return;
       rehearsal_->publish(empty_);
       if (connected_ && to_itself_.is_open()) {
-        std::array<std::uint8_t, serialized_empty.size()> back;
+        std::array<std::uint8_t, serialized_empty.size()> received{};
         [[maybe_unused]] auto bytes =
             send(to_itself_.number(), serialized_empty.data(), serialized_empty.size(), 0);
-        bytes = recv(to_itself_.number(), back.data(), back.size(), 0);
+        bytes = recv(to_itself_.number(), received.data(), received.size(), 0);
       }
     }
   }
 
-  // How fast cores wake up (us); -1: they may sleep, as if nothing had been asked for.
+  // Asks the kernel for cores that wake up within so many us; -1: they may sleep as they like.
   void ask_for(std::int32_t latency_us = -1) const {
     if (latency_.is_open()) [[maybe_unused]]
       const auto written = write(latency_.number(), &latency_us, sizeof(latency_us));
@@ -106,7 +110,7 @@ public:
 
 private:
   static constexpr std::array<std::uint8_t, 5> serialized_empty{0, 1, 0, 0, 0};
-  // A rehearsal is not begun later before a release than this: the first may take most of it.
+  // No rehearsal begins later than this before a release: the first may take most of this time.
   static constexpr std::int64_t rehearsal_ns = 400'000;
 
   std::int64_t pause_ns_;

@@ -56,13 +56,15 @@ inline std::size_t depth_of(const Parameters & parameters, std::size_t history) 
 // Returns four bytes of a serialized message, in the byte order that its encapsulation header
 // names.
 inline std::uint32_t word_at(const std::uint8_t * payload, std::size_t at) {
-  const bool little = payload[1] & 1;
+  const bool little = (payload[1] & 1) != 0;
   std::uint32_t value = 0;
   for (std::size_t i = 0; i < 4; ++i)
     value |= std::uint32_t{payload[at + i]} << (8 * (little ? i : 3 - i));
   return value;
 }
 
+// Returns the stamp of a serialized message whose first field is a header; none if it is zero or no
+// stamp at all.
 inline Maybe origin_of(const std::uint8_t * payload, std::size_t size) {
   if (size < 12) return std::nullopt;
   const std::int64_t seconds = static_cast<std::int32_t>(word_at(payload, 4));
@@ -71,6 +73,7 @@ inline Maybe origin_of(const std::uint8_t * payload, std::size_t size) {
   return seconds * 1'000'000'000 + nanoseconds;
 }
 
+// Returns the text of a serialized std_msgs/String; none: it is damaged.
 inline std::optional<std::string> text_of(const std::uint8_t * payload, std::size_t size) {
   if (size < 8) return std::nullopt;
   const std::size_t length = word_at(payload, 4);  // with the final NUL
@@ -86,25 +89,28 @@ inline std::int64_t clock_ns(clockid_t clock) {
 
 inline std::int64_t monotonic_ns() { return clock_ns(CLOCK_MONOTONIC); }
 
+// Sleeps until an instant of CLOCK_MONOTONIC; a signal does not end the sleep.
 inline void sleep_until(std::int64_t deadline_ns) {
   const auto [seconds, rest] = std::lldiv(std::max<std::int64_t>(0, deadline_ns), 1'000'000'000);
   const timespec request{static_cast<time_t>(seconds), static_cast<long>(rest)};  // NOLINT
   while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &request, nullptr) == EINTR) continue;
 }
 
+// Watches the clock until an instant of CLOCK_MONOTONIC; returns the time.
 inline std::int64_t watch_until(std::int64_t deadline_ns) {
   std::int64_t now = monotonic_ns();
   while (now < deadline_ns) now = monotonic_ns();
   return now;
 }
 
-// Give the calling thread SCHED_FIFO with a priority, or a core. False, and errno: it is refused.
+// Gives the calling thread SCHED_FIFO with a priority. Returns false (and errno) if it is refused.
 inline bool set_fifo(std::int64_t priority) {
   sched_param wanted{};
   wanted.sched_priority = static_cast<int>(priority);
   return sched_setscheduler(0, SCHED_FIFO | SCHED_RESET_ON_FORK, &wanted) == 0;
 }
 
+// Binds the calling thread to a core. Returns false (and errno) if it is refused.
 inline bool set_core(std::int64_t core) {
   cpu_set_t cores;
   CPU_ZERO(&cores);
@@ -123,8 +129,9 @@ void schedule(const Parameters & parameters, Warn warn) {
     warn("core " + std::to_string(parameters.core) + " is refused", "name another in the plan");
 }
 
+// Returns CLOCK_REALTIME minus CLOCK_MONOTONIC.
 inline std::int64_t clock_offset() {
-  // How long a measurement took, and the offset; in a longer time something else ran in between.
+  // How long the shortest measurement took, and the offset: in a longer one another thread ran.
   std::pair<std::int64_t, std::int64_t> best{std::numeric_limits<std::int64_t>::max(), 0};
   for (int attempt = 0; attempt < 5 && best.first >= 2'000; ++attempt) {
     const std::int64_t before = monotonic_ns();
@@ -174,7 +181,7 @@ public:
   std::optional<Outcome<Message>> hold() {
     const std::uint64_t number = queue.waiting.front().number;
     std::int64_t now = monotonic_ns();
-    turn_ns_ = now;  // before, this thread was busy with the message before it
+    turn_ns_ = now;  // until now, this thread was busy with the message before it
     Release release = queue.decide();
     on_decision(release);
     bool slept = false;
@@ -186,14 +193,14 @@ public:
         look_again();
         now = monotonic_ns();
       }
-      // The first time, it may have come long ago, and newer ones since.
+      // At the first look, the message may have come long ago, and newer ones since.
       if (!slept && (queue.gate.messages == Messages::newest || looked_ns_ == 0)) look_again();
       if (queue.waiting.front().number != number) return std::nullopt;
       if (queue.replaced(release, now)) release.drop(Dropped::replaced);
     }
     if (release.at_ns) {
       if (slept) on_waking(*release.at_ns);
-      // This thread is awake in time: other threads before that delayed nothing.
+      // This thread is awake in time: other threads that ran before have delayed nothing.
       if (slept && monotonic_ns() < *release.at_ns) waited_ns_ = others_ran_ns();
       now = watch_until(*release.at_ns);
       if (queue.gate.policy() == Policy::discard && missed(queue.gate, release, now)) {
@@ -204,8 +211,11 @@ public:
     return Outcome<Message>{queue.leave(release, now), release, now};
   }
 
+  // Returns whether the node has time for its other callbacks before the oldest message is due.
   bool nothing_due() { return nothing_due(monotonic_ns() + schema::others_ns); }
 
+  // Sleeps for `pause_ns` behind a publication, so that it is delivered first; not at all if the
+  // next message is due in that time.
   void rest(std::int64_t published_ns, std::int64_t pause_ns) {
     queue.free_ns = published_ns;
     look_again();
@@ -214,6 +224,9 @@ public:
     queue.free_ns = monotonic_ns();
   }
 
+  // Returns how much of the delay from a message's release until the thread was awake no thread
+  // used: interrupts took that, or the whole system lost the core. To be called right after
+  // publishing.
   std::int64_t time_lost(const Outcome<Message> & outcome) {
     const std::int64_t others = others_ran_ns() - waited_ns_;
     const std::int64_t since_ns = std::max(*outcome.release.at_ns, turn_ns_);
@@ -234,12 +247,14 @@ private:
     return at_ns && *at_ns > until_ns + spin_ns_;
   }
 
+  // Has the owner take what has come, and notes when.
   void look_again() {
     const std::int64_t now = monotonic_ns();
     look();
     looked_ns_ = now;
   }
 
+  // Returns how long this thread has been ready while other threads ran, as the kernel counts it.
   std::int64_t others_ran_ns() {
     const auto thread = static_cast<pid_t>(syscall(SYS_gettid));
     if (thread != thread_) {  // the file belongs to the thread that opened it

@@ -1,8 +1,8 @@
-"""Start and end processes: our own ones, and the user's command.
+"""Start and end child processes: chainshaper's own, and the user's command.
 
-**Our own** processes often have more rights than the users who can write into the folder in which
-they are started. So their Python is isolated (``-I``). It gets our package and, behind all other
-folders, those of the libraries that it needs, if nobody but root and we can change them.
+**Chainshaper's own** processes often have more rights than the users who can write into the folder
+in which they are started. So their Python is isolated (``-I``). It gets the package and, behind all
+other folders, those of the libraries that it needs, if only root and this user can change them.
 
 **The user's command**, such as `ros2 launch …`, is asked to end by SIGINT. Each of its processes
 must get that once, since a second one kills a node that is shutting down. A command in a terminal
@@ -10,7 +10,7 @@ expects that the terminal signals its whole process group; any other command pas
 to its processes by itself. Then whatever has not ended gets SIGINT, SIGTERM and at last SIGKILL,
 the whole group at once.
 
-All processes have sessions of their own, so that Ctrl-C reaches us only.
+All child processes have sessions of their own, so that Ctrl-C reaches this process only.
 """
 
 import contextlib

@@ -16,8 +16,8 @@ from processes import wait_for
 
 from chainshaper import InputError, OperationError, PlanRequest, open_recording
 from chainshaper.enforcement.node_threads import RecordedProcess, RecordedThread, allocate
-from chainshaper.flow import profiling
-from chainshaper.flow.profiling import (
+from chainshaper.flow import profiling_condition as condition_module
+from chainshaper.flow.profiling_condition import (
     chain_nodes,
     executors_of,
     profiled_cores,
@@ -150,7 +150,7 @@ def _family(pid: int) -> list[int]:
 def test_a_node_that_does_not_appear_is_named(
     nodes: dict[str, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(profiling, "START_NS", 0)
+    monkeypatch.setattr(condition_module, "START_NS", 0)
     with (
         pytest.raises(OperationError, match=r"node /lost has not .* running: /front, /rear"),
         profiling_condition(["/front", "/lost"], folder=tmp_path) as see_to_it,

@@ -18,8 +18,8 @@ from processes import is_alive, wait_for
 from small_chain import small_chain_text
 
 import chainshaper
-from chainshaper.linux import own_processes
-from chainshaper.linux.own_processes import (
+from chainshaper.linux import child_processes
+from chainshaper.linux.child_processes import (
     check_command,
     end_command,
     end_in_words,
@@ -69,7 +69,7 @@ def test_one_place_starts_python() -> None:
         if re.search(r"sys\.executable|multiprocessing|ProcessPool", path.read_text())
     }
     in_nodes, again = "robot/clear_core.py", "robot/python/respawning.py"
-    assert starting.keys() == {"linux/own_processes.py", in_nodes, again}
+    assert starting.keys() == {"linux/child_processes.py", in_nodes, again}
     assert '[sys.executable, "-I", "-S", "-c"' in starting[in_nodes]
 
 
@@ -77,7 +77,7 @@ def test_one_place_starts_python() -> None:
 def test_nothing_of_the_current_folder_or_of_python_variables_runs(module: str, evil: Path) -> None:
     variables = ("PYTHONPATH", "PYTHONHOME", "PYTHONUSERBASE", "PYTHONSTARTUP", "HOME")
     with mock.patch.dict(os.environ, dict.fromkeys(variables, str(evil))):
-        command = module_command(module, own_processes.LIBRARIES)
+        command = module_command(module, child_processes.LIBRARIES)
         run = subprocess.run(
             command, cwd=evil, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False
         )
@@ -118,7 +118,7 @@ def copied(folder: Path) -> Path:
     """The package where nothing but PYTHONPATH leads to, as colcon installs it."""
     root = folder / "install"
     values = ("__init__", "errors", "files", "leftovers", "middleware")
-    linux = ("__init__", "own_processes", "scheduling", "threads")
+    linux = ("__init__", "child_processes", "scheduling", "threads")
     for name in ("__init__", *(f"values/{v}" for v in values), *(f"linux/{one}" for one in linux)):
         place = root / "chainshaper" / f"{name}.py"
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -131,7 +131,7 @@ def copied(folder: Path) -> Path:
 
 _STARTS = (
     "import subprocess, sys; sys.path[:0] = [{root!r}]; "
-    "from chainshaper.linux.own_processes import module_command; "
+    "from chainshaper.linux.child_processes import module_command; "
     "sys.exit(subprocess.run(module_command('chainshaper.said', ['library'])).returncode)"
 )
 
@@ -208,7 +208,7 @@ def test_tools_are_not_found_in_the_current_folder(
     for path in (".", "", f":{os.environ['PATH']}", f"./:{os.environ['PATH']}:."):
         monkeypatch.setenv("PATH", path)
         assert not is_installed(tool.name)
-        assert all(map(os.path.isabs, own_processes.tool_environment()["PATH"].split(":")))
+        assert all(map(os.path.isabs, child_processes.tool_environment()["PATH"].split(":")))
     monkeypatch.setenv("PATH", str(tmp_path))
     assert is_installed(tool.name)
 
@@ -337,7 +337,7 @@ def test_a_command_gets_a_sigint_when_we_are_killed(tmp_path: Path) -> None:
     script = f"trap 'echo interrupted > {said}; exit' INT; echo ready; while :; do sleep 0.05; done"
     program = (
         "import time\n"
-        "from chainshaper.linux.own_processes import start_command\n"
+        "from chainshaper.linux.child_processes import start_command\n"
         f"start_command(['sh', '-c', {script!r}])\n"
         "time.sleep(60)"
     )
