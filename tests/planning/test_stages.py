@@ -217,6 +217,26 @@ def test_a_pipeline_by_hand(tmp_path: Path) -> None:
     assert slots["stage1"] == ((0, 97 * MS),), "its timer waits: all slots count from one instant"
 
 
+def test_a_stage_that_overran_goes_on_while_the_next_one_of_its_core_waits_for_it() -> None:
+    """The third stage has the second's core, and the better priority: what is older goes first."""
+    plan = planned([[49, 69, 49]])
+    assert {server.name: (server.core, server.priority) for server in plan.servers} == {
+        "stage1": (1, 2), "stage2": (0, 2), "stage3": (1, 2), "output": (1, 1)
+    }  # fmt: skip
+    opened = open_until_done(plan)
+    assert {server.name: server.priority for server in opened.servers} == {
+        "stage1": 3, "stage2": 2, "stage3": 2, "output": 1
+    }  # fmt: skip
+    enforced = slots_ms(opened)
+    assert enforced["stage1"] == [(0, 100)], "through the third stage's slot, [50, 100)"
+    assert enforced["stage2"] == [(0, 49), (49, 100)], "nothing else has its core"
+    assert enforced["stage3"] == [(50, 100)], "then a new instance has the core"
+    besides = {server.name: server.slots for server in open_until_done(plan, 0, {1}).servers}
+    assert besides["stage1"] == ((0, 50 * MS),), "where other chains have the core, as planned"
+    waiting = {server.name: server.slots for server in open_until_done(plan, 2 * MS).servers}
+    assert waiting["stage1"] == ((0, 98 * MS),), "its timer waits"
+
+
 def test_a_pipeline_is_measured_on_the_cores_of_its_stages() -> None:
     """By the medians, of which no half is longer than a cycle; and where no cut fits, evenly."""
     request = PlanRequest(policy="pipelined")

@@ -8,13 +8,20 @@ thread may run again.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise, product
 from typing import NamedTuple
 
 from chainshaper.planning import chain_plan as plans
-from chainshaper.planning.chain_plan import PER_CALLBACK, ChainPlan, ShapingNode, Slot, Thread
+from chainshaper.planning.chain_plan import (
+    PER_CALLBACK,
+    ChainPlan,
+    Server,
+    ShapingNode,
+    Slot,
+    Thread,
+)
 from chainshaper.planning.late_shares import cycles_needed
 from chainshaper.planning.margins import OVERRUN_PROBABILITY
 from chainshaper.values.durations import duration_text, milliseconds
@@ -81,7 +88,9 @@ def output_lifespan(plan: ChainPlan) -> int | None:
     return max([slots[0][1], *(after[1] - before[1] for before, after in pairwise(slots))])
 
 
-def open_until_done(plan: ChainPlan, closed_ns: int = 0) -> ChainPlan:
+def open_until_done(
+    plan: ChainPlan, closed_ns: int = 0, shared_cores: Collection[int] = ()
+) -> ChainPlan:
     """Return the plan as back ends and the simulator carry it out: overruns may finish.
 
     The servers that run the chain to its end stay open until the cycle's end (section 6): stopped
@@ -89,7 +98,13 @@ def open_until_done(plan: ChainPlan, closed_ns: int = 0) -> ChainPlan:
     an output that missed its slot is to leave at once, the last publish slot of an asynchronous
     publisher stays open, too. The slots of other servers of the same core and priority are left
     out, and so are the last ``closed_ns`` of a cycle: a thread whose timer expires in these waits
-    for its slot. A stage of a pipeline stays open until the next slot of its core begins.
+    for its slot.
+
+    A stage of a pipeline stays open until the next slot of its core begins. If that is of a later
+    stage of the same instance, it stays open until that closes, and has a worse priority: a stage
+    that overran goes on while the later one, which may wait for it, has nothing to do. Stopped, it
+    would go on in the next cycle, and each output would be a cycle late until short executions made
+    up for it. On ``shared_cores``, which other chains have as well, this is left out.
 
     Servers of callbacks stay open too, except those in which chains begin: a callback that was
     stopped would take its next slot, and every output would be late until two short executions met.
@@ -100,8 +115,11 @@ def open_until_done(plan: ChainPlan, closed_ns: int = 0) -> ChainPlan:
         return plan
     end_ns = plan.cycle_ns - closed_ns
     if plan.policy == "pipelined" and plan.overrun == "publish":
-        slots = _until_next_stage(plan, end_ns)
-        return plans.revised(plan, servers=plans.with_slots(plan.servers, slots))
+        opened = plans.with_slots(plan.servers, _until_next_stage(plan, end_ns))
+        with_longer = plan.model_copy(update={"servers": opened})
+        through = _through_next_stage(with_longer, end_ns, shared_cores)
+        servers = tuple(through.get(server.name, server) for server in opened)
+        return plans.revised(plan, servers=servers)
     if plan.policy == "server-per-callback":
         slots = {}
         for server in plan.servers:
@@ -130,6 +148,48 @@ def _until_next_stage(plan: ChainPlan, end_ns: int) -> dict[str, Sequence[Slot]]
             for start, end in stage.slots
         ]
     return longer
+
+
+def _through_next_stage(
+    plan: ChainPlan, end_ns: int, shared_cores: Collection[int]
+) -> dict[str, Server]:
+    """Return, by name, the stages of cores that have several, with priorities of their own.
+
+    A stage behind which a later one of the same instance has the core stays open until that closes,
+    the first of all until ``end_ns`` at the latest.
+    """
+    cycle_ns, stages = plan.cycle_ns, [*plans.running_servers(plan)]
+    through: dict[str, Server] = {}
+    for core in {stage.core for stage in stages}.difference(shared_cores):
+        of_core = [stage for stage in stages if stage.core == core]  # in the chain's order
+        best = min(stage.priority for stage in of_core)
+        if any(stage.priority != best for stage in of_core):
+            continue  # the core is named twice, and has two stages at a time
+        for place, stage in enumerate(of_core):
+            opens, closes = _whole_slot(stage, cycle_ns)
+            behind = []  # how long after this stage each other one opens and closes
+            for number, beside in enumerate(of_core):
+                if beside is not stage:
+                    begins, ends = _whole_slot(beside, cycle_ns)
+                    wait = (begins - closes) % cycle_ns
+                    behind.append((wait, wait + ends - begins, number))
+            slots = stage.slots
+            if behind and min(behind)[2] > place:
+                until = closes + min(behind)[1]
+                if stage is stages[0]:
+                    until = min(until, max(closes, end_ns))
+                slots = united(in_cycle(opens, until, cycle_ns))
+            change = {"slots": slots, "priority": best + len(of_core) - 1 - place}
+            through[stage.name] = stage.model_copy(update=change)
+    return through
+
+
+def _whole_slot(stage: Server, cycle_ns: int) -> Slot:
+    """Return a stage's slot, which may go beyond the end of the cycle, as one."""
+    (first, *_), (last, *_) = stage.slots[0], stage.slots[-1]
+    if len(stage.slots) > 1 and first == 0 and stage.slots[-1][1] == cycle_ns:
+        return last, cycle_ns + stage.slots[0][1]
+    return first, stage.slots[-1][1]
 
 
 def _until_cycle_end(plan: ChainPlan, end_ns: int) -> dict[str, Sequence[Slot]]:

@@ -225,7 +225,13 @@ def open_until_done(plan: Plan, waits_ns: Sequence[int] = ()) -> Plan:
     for chain_plan, wait_ns in zip(plan.chains, known_ns, strict=True):
         waits = plan.moves_timers or chain_plan.policy in ("pipelined", "server-per-callback")
         closed_ns = wait_ns + WAITING_NS if waits else 0
-        longer = chain_open_until_done(chain_plan, closed_ns).servers
+        shared = {
+            server.core
+            for beside in plan.chains
+            for server in beside.servers
+            if beside is not chain_plan
+        }
+        longer = chain_open_until_done(chain_plan, closed_ns, shared).servers
         for planned, server in zip(chain_plan.servers, longer, strict=True):
             slots = slots_without(server.slots, [*_of_other_chains(plan, chain_plan, server)])
             switched = {instant for slot in slots for instant in slot}

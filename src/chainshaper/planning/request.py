@@ -38,6 +38,7 @@ from chainshaper.planning.latencies import check_latencies
 from chainshaper.planning.offsets import refuse_common
 from chainshaper.planning.pipeline import Work, pipelined, stage_places, work_of
 from chainshaper.planning.profile import (
+    GATE_TAKES_NS,
     UNKNOWN,
     Profile,
     alone,
@@ -569,7 +570,32 @@ def _with_policy(plan: ChainPlan, profile: Profile, request: PlanRequest) -> Cha
         plan = shaping.server_per_callback(plan, profile.callbacks, margin_ns=margin_ns)
     else:
         plan = shaping.let_per_callback(plan, profile.topics, profile.nodes)
+        _refuse_full_cores(plan, profile)
     return plan
+
+
+def _refuse_full_cores(plan: ChainPlan, profile: Profile) -> None:
+    """Refuse LET per callback where callbacks of a core may take longer than a cycle, together.
+
+    In each cycle all callbacks run, for as many instances. What is not done then delays the next
+    cycle's, and so on: the outputs of a core that is full once stay late.
+    """
+    with_branches = bool(profile.graph_steps_ns.size)
+    steps = profile.every_graph_step_ns if with_branches else profile.every_step_ns
+    if not steps.size:
+        return
+    nodes = [step.node for step in profile.callbacks] if with_branches else profile.nodes
+    busy_ns = Counter[int]()
+    for node, longest_ns in zip(nodes, steps.max(axis=0).tolist(), strict=True):
+        busy_ns[profile.core_of.get(node, DEFAULT_CORE)] += longest_ns
+    for gate in plans.shaping_nodes(plan):
+        busy_ns[gate.core] += GATE_TAKES_NS + gate.spin_ns
+    for core, taken_ns in busy_ns.items():
+        if taken_ns + profile.others_ns > plan.cycle_ns:
+            reason = f"{profile.name}: the callbacks of core {core} and their gates take up to"
+            reason += f" {duration_text(taken_ns + profile.others_ns)} in a cycle, which has"
+            reason += f" {duration_text(plan.cycle_ns)}, and what is not done delays the next"
+            raise OperationError(f"{reason}: give the chain more cores (--cores), or shape it")
 
 
 def _pipelined(plan: ChainPlan, profile: Profile, cores: Sequence[int] | None) -> ChainPlan:
