@@ -3,28 +3,43 @@
 # Where it is set, as images of containers like to, every process of a test compiles all it imports.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-untimed test-timed test-waiting test-kernel core-tests lint benchmark experiments docs clean
+# The library is built for each Python, for colcon, and for this .venv: what these builds have in
+# common is compiled once where ccache is installed.
+ccache := $(shell which ccache)
+ifneq ($(ccache),)
+export CMAKE_C_COMPILER_LAUNCHER = $(ccache)
+export CMAKE_CXX_COMPILER_LAUNCHER = $(ccache)
+export CCACHE_DIR = $(CURDIR)/build/ccache
+endif
+
+.PHONY: demo test test-untimed test-timed test-waiting test-building test-kernel core-tests lint benchmark experiments docs clean
 
 demo: .venv/.ready
 	.venv/bin/chainshaper demo
 
 # Tests that need the machine's cores for themselves, and beside them those that mostly wait for
-# tracers and other programs, all others, which leave the cores to these (tests/conftest.py), the C++
-# library's own, and what looks at the code. What had to be tried twice stands at the end.
-test: .venv/.ready-dev
+# tracers and other programs; those that compile, and all others, which leave the cores to these
+# (tests/conftest.py); the C++ library's own; and what looks at the code. What had to be tried twice
+# stands at the end.
+test:
 	scripts/test-tools
 	rm -rf build/tried
-	$(MAKE) --jobs=5 --output-sync=line lint core-tests test-untimed test-timed test-waiting; \
+	$(MAKE) .venv/.ready-dev
+	$(MAKE) --jobs=6 --output-sync=line \
+		lint core-tests test-untimed test-timed test-waiting test-building; \
 		code=$$?; scripts/run-tests --tried-twice; exit $$code
 
 test-untimed: .venv/.ready-dev
-	scripts/run-tests untimed "not timed and not waiting" nice
+	scripts/run-tests untimed "not timed and not waiting and not building" nice
 
 test-timed: .venv/.ready-dev
 	scripts/run-tests timed timed
 
 test-waiting: .venv/.ready-dev
-	scripts/run-tests waiting "waiting and not timed"
+	scripts/run-tests waiting "waiting and not timed and not building"
+
+test-building: .venv/.ready-dev
+	scripts/run-tests building building nice
 
 # In QEMU, what needs another kernel than this machine's: the sched_ext back end, LTTng's kernel
 # tracer. Fetches about 130 MB once; a quarter of an hour or so.

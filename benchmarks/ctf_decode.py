@@ -20,6 +20,11 @@ babeltrace2's 1.58 s divided by them:
     all fields     0.195  (8.1)   0.142  (11.1)
     =============  =============  =============
 
+Since then sorting in blocks that fit the cache, and stepping from event to event by their spans,
+save 7 of 100 parts of all fields' time, by either clock. What is left, in parts of 100: sorting
+25; stepping and writing 17; counting 15; zeroing fresh memory 13; moving values, looking up texts
+11; Polars, Python and the rest of the kernel 19.
+
 All but a tenth of the work runs on as many threads as there are cores; Numba's sorted the rows, a
 quarter of its work, on one. Its wall-clock ratio for all fields on two quiet cores was 16 to 17.
 """

@@ -47,7 +47,15 @@ def commands(page: Path) -> list[str]:
     return [line[2:] for block in blocks for line in block.splitlines() if line.startswith("$ ")]
 
 
-PAGES_WITH_COMMANDS = [pytest.param(page, id=page.name) for page in PAGES if commands(page)]
+def marks_of(page: Path) -> list[pytest.MarkDecorator]:
+    """To install a clone compiles it."""
+    installs = any("pip install" in command for command in commands(page))
+    return [pytest.mark.building] if installs else []
+
+
+PAGES_WITH_COMMANDS = [
+    pytest.param(page, id=page.name, marks=marks_of(page)) for page in PAGES if commands(page)
+]
 
 
 def shortened(command: str, cycles: int) -> str:
@@ -132,7 +140,7 @@ def tried(steps: Callable[[Path, int], Iterable[str]], folder: Path, recorded: P
     pytest.fail(f"{command}\n{finished.out}\n{finished.err}")
 
 
-@pytest.mark.timeout(600)  # to install a clone compiles it
+@pytest.mark.timeout(600)  # it waits for the cores, or compiles a clone
 @pytest.mark.parametrize("page", PAGES_WITH_COMMANDS)
 def test_every_command_runs(page: Path, tmp_path: Path, recorded: Path) -> None:
     def read(folder: Path, cycles: int) -> Iterable[str]:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-pytestmark = pytest.mark.waiting
+pytestmark = pytest.mark.building
 
 
 @pytest.mark.timeout(1800)

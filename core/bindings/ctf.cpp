@@ -24,23 +24,23 @@ using Numbers = Array<const std::int64_t>;
 
 // Types
 
-// A type of the metadata, as Python holds it.
+// A type of the metadata, as Python has it.
 struct FieldType {
   ctf::Type type;
 };
 
 using Fields = std::vector<std::pair<std::string, FieldType>>;
 
-std::vector<ctf::Field> fields_of(const Fields & given) {
+std::vector<ctf::Field> fields_of(const Fields & types) {
   std::vector<ctf::Field> fields;
-  fields.reserve(given.size());
-  for (const auto & [name, field] : given) fields.push_back({name, field.type});
+  fields.reserve(types.size());
+  for (const auto & [name, field] : types) fields.push_back({name, field.type});
   return fields;
 }
 
-std::optional<ctf::Structure> structure_of(const std::optional<FieldType> & given) {
-  if (!given) return std::nullopt;
-  const auto * structure = std::get_if<ctf::Structure>(&given->type->is);
+std::optional<ctf::Structure> structure_of(const std::optional<FieldType> & scope) {
+  if (!scope) return std::nullopt;
+  const auto * structure = std::get_if<ctf::Structure>(&scope->type->is);
   if (structure == nullptr) throw std::invalid_argument("a scope is a structure");
   return *structure;
 }
@@ -73,7 +73,7 @@ void bind_types(nb::module_ & module) {
                   nb::arg("labels"), "An integer or an enumeration.")
       .def_static(
           "string", [] { return FieldType{ctf::checked({ctf::String{}})}; },
-          "Bytes up to and with the first NUL.")
+          "Bytes up to and including the first NUL.")
       .def_static("array", &array, nb::kw_only(), nb::arg("element"), nb::arg("length"),
                   nb::arg("is_text"), "An array, or a sequence where the length is a path.")
       .def_static("structure", &structure, nb::kw_only(), nb::arg("fields"), nb::arg("align"),
@@ -135,7 +135,7 @@ void bind_layout(nb::module_ & module) {
       .value("EVENT_CONTEXT", ctf::Scope::event_context)
       .value("EVENT_FIELDS", ctf::Scope::event_fields);
 
-  nb::class_<ctf::WantedEvent>(module, "CtfWantedEvent", "An event class that is asked for.")
+  nb::class_<ctf::WantedEvent>(module, "CtfWantedEvent", "An event class that is wanted.")
       .def(
           "__init__",
           [](ctf::WantedEvent * self, std::size_t event, std::int32_t table,
@@ -145,7 +145,7 @@ void bind_layout(nb::module_ & module) {
           },
           nb::kw_only(), nb::arg("event"), nb::arg("table"), nb::arg("columns"));
 
-  nb::class_<ctf::Layout>(module, "CtfLayout", "How the bits of some traces' packets lie.")
+  nb::class_<ctf::Layout>(module, "CtfLayout", "Where the bits of some traces' packets are.")
       .def(
           "__init__",
           [](ctf::Layout * self, const std::vector<ctf::TraceClass> & traces,
@@ -155,7 +155,7 @@ void bind_layout(nb::module_ & module) {
           nb::arg("traces"), nb::arg("wanted"))
       .def_ro("traces", &ctf::Layout::traces, "The stream classes of each trace: first and end.");
 
-  // It becomes ValueError(reason, trace): with the trace, a message can name its file.
+  // It becomes ValueError(reason, trace), so that a message can name the trace's file.
   nb::register_exception_translator([](const std::exception_ptr & thrown, void * /*payload*/) {
     try {
       std::rethrow_exception(thrown);
@@ -226,7 +226,7 @@ void bind_packets(nb::module_ & module) {
 
 // Events
 
-// The columns of a table, and the arrays that they are in, which are kept alive.
+// The columns of a table, and the arrays that they are in, so that these stay alive.
 struct EventTable {
   std::vector<nb::object> arrays;
   ctf::TableColumns columns;
@@ -275,13 +275,13 @@ nb::list write_events(const EventFile & file, const ctf::Chunk & chunk,
   return strings;
 }
 
-void recode(const Array<std::uint32_t> & codes, const Array<const std::uint32_t> & others) {
+void recode(const Array<std::uint32_t> & codes, const Array<const std::uint32_t> & new_codes) {
   const auto rows = span_of(codes);
-  const auto known = span_of(others);
+  const auto replacements = span_of(new_codes);
   without_lock([&] {
     for (auto & code : rows) {
-      if (code >= known.size()) throw std::invalid_argument("a code of no text");
-      code = known[code];
+      if (code >= replacements.size()) throw std::invalid_argument("a code of no text");
+      code = replacements[code];
     }
   });
 }
@@ -372,8 +372,8 @@ void bind_events(nb::module_ & module) {
                    })
       .def_prop_ro("bad_events", [](const EventFile & self) { return self.reader.bad_events(); });
 
-  module.def("recode", &recode, nb::arg("codes"), nb::arg("others"),
-             "Replace each code of a column by the one that `others` has for it.");
+  module.def("recode", &recode, nb::arg("codes"), nb::arg("new_codes"),
+             "Replace each code of `codes` by `new_codes[code]`, in place.");
 }
 
 }  // namespace

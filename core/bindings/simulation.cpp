@@ -125,7 +125,7 @@ void bind_callbacks(nb::module_ & module) {
       .def_rw("trigger", &SynchroniserDescription::trigger, nb::arg().none());
 }
 
-// A field of the gate itself that is a word in Python.
+// Reads and writes a field of the gate itself that is a word in Python.
 template <typename Value, typename Owner, typename Words>
 auto word_of(Value Owner::* field, const Words & words) {
   return std::pair(
@@ -214,7 +214,8 @@ void bind_description(nb::module_ & module) {
       .def_rw("most_messages", &Description::most_messages);
 }
 
-// Makes a source that asks Python for numbers; it takes Python's lock, which the engine has not.
+// Makes a source that asks Python for numbers. It takes Python's lock, since the engine runs
+// without.
 Source source_from(nb::callable draw) {
   return [draw = std::move(draw)](Place stream) {
     const nb::gil_scoped_acquire acquired;

@@ -1,5 +1,5 @@
-// Reading integers and texts from bytes at any bit (CTF 1.8, section 4.1.5). Nothing is read behind
-// the end of the bytes: what would lie there counts as 0.
+// Reads integers that begin at any bit (CTF 1.8, section 4.1.5). Nothing behind the end of the
+// bytes is read: bits there count as 0.
 
 #pragma once
 
@@ -14,7 +14,7 @@ static_assert(std::endian::native == std::endian::little, "packets are read on l
 
 using Bytes = std::span<const std::uint8_t>;
 
-// A number as it lies at an address, where all of its bytes are known to be.
+// Returns the number at an address, where all of its bytes must be.
 template <typename Number>
 Number load(const std::uint8_t * place) {
   Number number;
@@ -22,12 +22,12 @@ Number load(const std::uint8_t * place) {
   return number;
 }
 
-// The low `count` bits, 0 to 64 of them.
+// Returns the low `count` bits, 0 to 64.
 inline std::uint64_t low_bits(std::uint64_t word, std::int64_t count) {
   return count >= 64 ? word : word & ((std::uint64_t{1} << count) - 1);
 }
 
-// The little-endian 8 bytes at byte `at`, which is not negative.
+// Returns the little-endian 8 bytes at byte `at`, which is not negative.
 inline std::uint64_t word_at(Bytes bytes, std::int64_t at) {
   const auto place = static_cast<std::size_t>(at);
   if (place + 8 <= bytes.size()) [[likely]]
@@ -43,7 +43,7 @@ inline std::uint64_t byte_at(Bytes bytes, std::int64_t at) {
   return place < bytes.size() ? bytes[place] : 0;
 }
 
-// An unsigned integer of 1 to 64 bits that begins at any bit.
+// Returns the unsigned integer of 1 to 64 bits that begins at a bit.
 inline std::uint64_t bits_at(Bytes bytes, std::int64_t position, std::int64_t size,
                              bool big_endian) {
   const auto at = position >> 3;
@@ -60,7 +60,7 @@ inline std::uint64_t bits_at(Bytes bytes, std::int64_t position, std::int64_t si
   return low_bits(word, size);
 }
 
-// An integer of `size` bits with its sign.
+// Returns the signed integer that has these `size` bits.
 inline std::int64_t with_sign(std::uint64_t bits, std::int64_t size) {
   return static_cast<std::int64_t>(bits << (64 - size)) >> (64 - size);
 }

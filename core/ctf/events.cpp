@@ -7,7 +7,7 @@
 namespace chainshaper::ctf {
 namespace {
 
-// If all bytes of a header are zeros, and so many behind it, there is no event.
+// A header of zeros, with so many more bytes of zeros behind it, is no event.
 constexpr std::int64_t zeros_of_no_event = 32;
 
 // Bytes ahead of an event that are fetched while it is read.
@@ -16,6 +16,7 @@ constexpr std::size_t read_ahead = 1024;
 struct Header {
   Reached behind;
   const EventLayout * event;  // nullptr where `behind` is a failure
+  std::int64_t end{0};        // bits: behind the event; 0: not known yet
 };
 
 // Reads the headers of packets and events.
@@ -39,6 +40,7 @@ public:
     return run_.steps(stream_.packet_context, content_, header.bits());
   }
 
+  // Reads an event's header, and sets the clock.
   Header read(std::int64_t position) const {
     if (const auto & quick = stream_.quick; quick.align != 0) {
       const auto at = align_up(position, quick.align);
@@ -46,13 +48,13 @@ public:
       const auto byte = static_cast<std::size_t>(at >> 3);
       if (behind <= content_.end && byte + 8 <= content_.bytes.size()) {
         const auto * place = content_.bytes.data() + byte;
-        // Waiting for the memory of the next headers would take most of the time.
+        // Without this, waiting for the memory of the next headers would take most of the time.
         if (byte + read_ahead < content_.bytes.size()) __builtin_prefetch(place + read_ahead);
         const auto word = load<std::uint64_t>(place);
         const auto last = low_bits(~std::uint64_t{0}, quick.id_bits);
         if ((word & last) != last) {
           run_.set_clock(low_bits(word >> quick.clock_shift, quick.clock_bits), quick.clock_bits);
-          return named(static_cast<std::int64_t>(word & last), behind);
+          return named(word & last, at, behind);
         }
       }
     }
@@ -62,16 +64,29 @@ public:
     return named(run_.variable(event_id), behind.bits());
   }
 
+  // Returns the position behind an event of constant layout.
+  Reached end_of(const Header & header) const {
+    const EventLayout & event = *header.event;
+    const auto end =
+        header.end != 0 ? header.end : align_up(header.behind.bits(), event.align) + event.size;
+    return end <= content_.end ? Reached(end) : Reached(Failure::truncated);
+  }
+
   // Returns the position behind an event's contexts and payload, without writing anything.
-  Reached step_over(const EventLayout & event, std::int64_t position) const {
-    if (event.align != 0) {
-      const auto behind = align_up(position, event.align) + event.size;
-      return behind <= content_.end ? Reached(behind) : Reached(Failure::truncated);
-    }
-    return run_.steps(event.steps, content_, position);
+  Reached step_over(const Header & header) const {
+    if (header.end != 0 || header.event->align != 0) return end_of(header);
+    return run_.steps(header.event->steps, content_, header.behind.bits());
   }
 
 private:
+  // The event whose quick header is from `at` to `behind`.
+  Header named(std::uint64_t id, std::int64_t at, std::int64_t behind) const {
+    if (id >= stream_.quick_events.size()) return named(static_cast<std::int64_t>(id), behind);
+    const auto [event, span] = stream_.quick_events[static_cast<std::size_t>(id)];
+    if (event == none) return {Failure::unknown_event, nullptr};
+    return {behind, &layout_.events[static_cast<std::size_t>(event)], span == 0 ? 0 : at + span};
+  }
+
   Header named(std::int64_t id, std::int64_t behind) const {
     const auto event = stream_.event(id);
     if (event == none) return {Failure::unknown_event, nullptr};
@@ -84,7 +99,8 @@ private:
   Run & run_;
 };
 
-// Whether a header and the bytes behind it are zeros, as where a disk has not got the data.
+// Whether a header and the bytes behind it are zeros, as in a file whose data never reached the
+// disk.
 bool only_zeros(const Content & content, std::int64_t position, std::int64_t behind) {
   const auto first = position >> 3, last = (behind >> 3) + zeros_of_no_event;
   if (last > content.end >> 3) return false;
@@ -99,9 +115,9 @@ bool is_zero(const Content & content, std::int64_t position) {
          load<std::uint32_t>(content.bytes.data() + static_cast<std::size_t>(at)) == 0;
 }
 
-// Checks that a tracer can have written an event whose header is from `position` to `behind`: it
-// happened while its packet was open, in a process, and its bytes are not all zeros. Returns
-// `behind`, or what is wrong.
+// Checks that a tracer can have written an event, whose header is from `position` to `behind`: it
+// happened while its packet was open, in a process with a number, and its bytes are not all zeros.
+// Returns `behind`, or what is wrong.
 Reached believed(const Headers & headers, const PacketEvents & packet, const Run & run,
                  std::int64_t position, std::int64_t behind, const EventLayout * event_of_id_0,
                  const EventLayout * event) {
@@ -120,7 +136,7 @@ Reached believed(const Headers & headers, const PacketEvents & packet, const Run
   return behind;
 }
 
-// Nanoseconds of so many cycles, rounded down.
+// Converts clock cycles to nanoseconds, rounded down.
 std::int64_t nanoseconds(std::uint64_t cycles, std::int64_t frequency_hz) {
   constexpr std::uint64_t billion = 1'000'000'000;
   const auto rate = static_cast<std::uint64_t>(frequency_hz);
@@ -128,13 +144,13 @@ std::int64_t nanoseconds(std::uint64_t cycles, std::int64_t frequency_hz) {
   return static_cast<std::int64_t>(cycles / rate * billion + cycles % rate * billion / rate);
 }
 
-// Events of one class and of constant layout, written together: column by column, without a branch
-// for each value.
+// Events of a class of constant layout that are written together, column by column, so that there
+// is no branch for each value.
 struct Batch {
   static constexpr std::size_t most = 128;
 
   std::size_t count{0};
-  std::size_t first_row{0};  // of their table; the others follow it
+  std::size_t first_row{0};  // of the first event; the rows of the others follow
   std::array<const std::uint8_t *, most> places{};
 
   bool is_followed_by(std::size_t row) const { return count < most && first_row + count == row; }
@@ -159,9 +175,11 @@ public:
         ends_(std::move(ends)),
         batches_(layout.events.size()) {}
 
-  // Writes an event that is wanted, whose contexts and payload begin at `position`.
-  Reached write(const EventLayout & event, const PacketEvents & packet, const Headers & headers,
-                Run & run, std::int64_t position) {
+  // Writes an event that is wanted; returns the position behind it.
+  Reached write(const Header & header, const PacketEvents & packet, const Headers & headers,
+                Run & run) {
+    const EventLayout & event = *header.event;
+    const auto position = header.behind.bits();
     const auto number = static_cast<std::size_t>(event.table);
     const TableColumns & table = tables_[number];
     if (rows_[number] >= ends_[number]) return Failure::table_full;
@@ -173,18 +191,18 @@ public:
       const Row place{table.columns.data(), row, &texts_};
       return run.steps(event.steps, content, position, &place);
     }
-    const auto begin = align_up(position, event.align);
-    if (begin + event.size > content.end) return Failure::truncated;
+    const auto end = headers.end_of(header);
+    if (end.failed()) return end;
     Batch & batch = batches_[static_cast<std::size_t>(&event - layout_.events.data())];
     if (!batch.is_followed_by(row)) {
       move(event, batch);
       batch.first_row = row;
     }
-    batch.places[batch.count++] = content.bytes.data() + (begin >> 3);
-    return begin + event.size;
+    batch.places[batch.count++] = content.bytes.data() + (align_up(position, event.align) >> 3);
+    return end;
   }
 
-  // Writes what still waits; whether all rows were written that were expected.
+  // Writes the batches that are not written yet; returns whether all expected rows were written.
   bool finish() {
     for (std::size_t number = 0; number < batches_.size(); ++number)
       move(layout_.events[number], batches_[number]);
@@ -232,8 +250,8 @@ private:
   const Layout & layout_;
   Bytes file_;
   std::span<const TableColumns> tables_;
-  std::vector<std::int64_t> rows_;  // the next one of each table
-  std::vector<std::int64_t> ends_;  // the one behind the last
+  std::vector<std::int64_t> rows_;  // the next row of each table
+  std::vector<std::int64_t> ends_;  // the end of the rows of each table
   std::vector<Batch> batches_;      // per event class
   Texts texts_;
 };
@@ -304,7 +322,7 @@ void EventReader::count_packet(std::size_t number) {
           believed(headers, packet, run_, position, reached.bits(), event_of_id_0, header.event);
     if (reached.failed()) break;
     const EventLayout & event = *header.event;
-    reached = headers.step_over(event, reached.bits());
+    reached = headers.step_over(header);
     if (!run_.afford(event.cost)) reached = Failure::over_budget;
     if (!reached.failed() && reached.bits() == position) reached = Failure::truncated;
     if (reached.failed()) break;
@@ -341,10 +359,8 @@ std::vector<Text> EventReader::write(const Chunk & chunk, std::span<const TableC
     while (!reached.failed() && reached.bits() < packet.content_bits) {
       const auto header = headers.read(reached.bits());
       if (header.behind.failed()) file_changed();
-      const auto position = header.behind.bits();
-      reached = header.event->table != none
-                    ? writer.write(*header.event, packet, headers, run, position)
-                    : headers.step_over(*header.event, position);
+      reached = header.event->table != none ? writer.write(header, packet, headers, run)
+                                            : headers.step_over(header);
     }
     if (reached.failed() || (packet.content_bits > 0 && reached.bits() > packet.content_bits))
       file_changed();

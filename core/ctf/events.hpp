@@ -1,6 +1,6 @@
-// The events of a stream file: counted in a first pass, so that each has its row, and written to
-// the columns of their tables in a second one. Files are cut into chunks of packets, which several
-// threads can write at once.
+// Reads the events of a stream file in two passes. The first pass counts them, so that the row of
+// each event is known; the second one writes them to the columns of their tables. Files are cut
+// into chunks of packets, which several threads can write at once.
 
 #pragma once
 
@@ -18,10 +18,10 @@ namespace chainshaper::ctf {
 // A packet whose events are to be read. EventReader checks that it is in the file.
 struct PacketEvents {
   std::int64_t offset;        // bytes from the file's beginning
-  std::int64_t content_bits;  // pass 1 shortens it to what can be read
+  std::int64_t content_bits;  // pass 1 shortens this to what can be read
   std::int64_t stream_class;  // in Layout::streams
   std::int64_t cpu;
-  // In clock cycles; what the times of its events can be.
+  // Between which the times of its events must be, in clock cycles.
   std::int64_t earliest{std::numeric_limits<std::int64_t>::min()};
   std::int64_t latest{std::numeric_limits<std::int64_t>::max()};
 };
@@ -33,40 +33,40 @@ struct BadEvent {
   Failure failure;
 };
 
-// Packets [first, end) of a file; the clock before the first one, and how many rows of each table
-// the file's events before and up to the chunk's end have.
+// Packets [first, end) of a file.
 struct Chunk {
   std::size_t first;
   std::size_t end;
-  std::uint64_t clock;
-  std::vector<std::int64_t> rows_before;
-  std::vector<std::int64_t> rows_after;
+  std::uint64_t clock;                    // before the first packet
+  std::vector<std::int64_t> rows_before;  // of each table, from the file's packets before the chunk
+  std::vector<std::int64_t> rows_after;   // the same, with the chunk's packets
 };
 
-// The columns of a table. `times_ns` and `cpus` (may be empty) have as many rows as the columns.
+// The columns of a table, all with the same number of rows.
 struct TableColumns {
   std::span<std::int64_t> times_ns;
-  std::span<std::int32_t> cpus;
-  std::vector<Column> columns;  // as the layout's table has them
+  std::span<std::int32_t> cpus;  // empty if they are not known
+  std::vector<Column> columns;   // in the order of the layout's table
 };
 
-// A file has not the events that were counted.
+// Thrown if a file no longer has the events that were counted.
 struct FileChanged : std::runtime_error {
   using std::runtime_error::runtime_error;
 };
 
 class EventReader {
 public:
-  // Throws std::invalid_argument for packets that are not in the file or of no stream class.
+  // Throws std::invalid_argument for packets that are not in the file, or of an unknown stream
+  // class.
   EventReader(const Layout & layout, Bytes file, std::vector<PacketEvents> packets);
 
-  // Pass 1. Steps over all events of the packets up to `end`, the first ones that were not counted
-  // yet, counts them, and shortens packets to what can be read.
+  // Pass 1. Counts the events of the packets up to `end` that were not counted yet, and shortens
+  // these packets to what can be read.
   Chunk count(std::size_t end);
 
-  // Pass 2. Writes the events of a chunk that go to tables, whose rows of this file begin at
-  // `first_rows`; returns the texts that text columns have codes of. Throws FileChanged. Threads
-  // may write at once.
+  // Pass 2. Writes the wanted events of a chunk to their tables, in which the rows of this file
+  // begin at `first_rows`. Returns the texts in the order of their codes. Throws FileChanged.
+  // Several threads may write chunks at once.
   std::vector<Text> write(const Chunk & chunk, std::span<const TableColumns> tables,
                           std::span<const std::int64_t> first_rows) const;
 

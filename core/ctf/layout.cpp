@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <array>
 #include <bit>
+#include <limits>
 #include <map>
 #include <stdexcept>
 #include <string>
@@ -16,7 +17,7 @@ constexpr std::size_t deepest = 12;
 // Types to lay out in all: a trace with all the kernel's events has some 10,000.
 constexpr std::size_t most_types = 200'000;
 constexpr std::int64_t dense_ids = 4096;
-// What a packet costs beside its steps: about the bytes that are noted of it.
+// What a packet costs in addition to its steps: about as many bytes as are stored about it.
 constexpr std::int64_t packet_row_cost = 120;
 
 // The fields of packet header and context, and of an event's header, that the decoder itself needs.
@@ -68,23 +69,25 @@ struct Number {
   const Integer * integer;
 };
 
-// The names in a structure or a variant; members of their own have frames of their own.
+// The names of numbers in a structure or a variant. Structures and variants that are its members
+// have frames of their own.
 struct Frame {
   std::map<std::string, Number, std::less<>> numbers;
   std::map<std::string, std::shared_ptr<Frame>, std::less<>> frames;
 
-  // A name that is declared again means the later one.
-  void note(const std::string & name, Number number) {
+  // Declares a number; of a name that is declared again, the later declaration counts.
+  void declare(const std::string & name, Number number) {
     frames.erase(name);
     numbers[name] = number;
   }
 
+  // Declares a member that has names in it; returns its frame.
   std::shared_ptr<Frame> enter(const std::string & name) {
     numbers.erase(name);
     return frames[name] = std::make_shared<Frame>();
   }
 
-  // The number at the end of a path `a.b.c`; nullptr for none.
+  // Returns the number at the end of a path `a.b.c`; nullptr: there is none.
   const Number * find(std::string_view path) const {
     const Frame * frame = this;
     for (auto dot = path.find('.'); dot != path.npos; dot = path.find('.')) {
@@ -103,7 +106,7 @@ struct Place {
   std::vector<std::shared_ptr<Frame>> frames;
   std::int32_t column{none};
 
-  // In a structure, variant or array, whose members get no columns.
+  // The place of members of a structure, variant or array, which get no columns.
   Place inside(std::shared_ptr<Frame> frame) const {
     Place place{frames, none};
     place.frames.push_back(std::move(frame));
@@ -113,12 +116,13 @@ struct Place {
 
 // Steps
 
-// Writes the steps of scopes that follow each other.
+// Writes the steps of scopes, one after the other.
 class Writer {
 public:
   Writer(Layout & layout, const TraceClass & trace) : layout_(&layout), trace_(&trace) {}
 
-  // A writer for what follows in one of several places.
+  // Returns a writer that knows the names that were declared so far: for one of several scopes that
+  // may follow.
   Writer following(bool in_headers) const {
     Writer writer = *this;
     writer.in_headers_ = in_headers;
@@ -128,7 +132,7 @@ public:
   // Begins a list of steps.
   void begin() { start_ = steps().size(); }
 
-  // The list of steps that was written since it began.
+  // Returns the list of steps that were written since it began.
   Steps written() const { return {start_, layout_->steps.size()}; }
 
   // Lays out a scope in a list of its own.
@@ -138,7 +142,7 @@ public:
     return written();
   }
 
-  // Lays out a scope at the end of the list. `columns` has the columns of the fields that have any.
+  // Lays out a scope at the end of the list. `columns`: number of a field → its column, if any.
   void append(const std::string & scope, const std::optional<Structure> & structure,
               const std::map<std::size_t, std::int32_t> & columns) {
     const auto frame = root(scope);
@@ -153,7 +157,7 @@ public:
     layout_->variables = std::max(layout_->variables, variables_);
   }
 
-  // Bit n: Variable n stands in these scopes.
+  // Returns which variables packet header and packet context have: bit n stands for Variable n.
   std::uint32_t known() const {
     std::uint32_t known = 0;
     for (const auto & [scope, frame] : roots_)
@@ -167,6 +171,7 @@ public:
 private:
   std::vector<Step> & steps() { return layout_->steps; }
 
+  // Begins the frame of a dynamic scope, in place of a frame that it has already.
   std::shared_ptr<Frame> root(const std::string & scope) {
     auto frame = std::make_shared<Frame>();
     for (auto & [name, known_frame] : roots_)
@@ -178,6 +183,7 @@ private:
     return frame;
   }
 
+  // Lays out a field of a scope; the trace's UUID as two numbers of 64 bits.
   void member(const Field & field, const Place & place) {
     const auto * array = as<Array>(field.type);
     const auto * length = array == nullptr ? nullptr : std::get_if<std::int64_t>(&array->length);
@@ -191,7 +197,7 @@ private:
     }
   }
 
-  // Lays out a type; returns the least number of bits that it takes, alignment aside.
+  // Lays out a type; returns the fewest bits that its values take, alignment aside.
   std::int64_t lay_out(const std::string & name, const Type & type, const Place & place) {
     count_types(1, name);
     if (place.frames.size() > deepest) too_deep(name);
@@ -224,22 +230,22 @@ private:
     bool sets_clock = integer.maps_clock;
     if (const auto fixed = well_known_variable(name, place); fixed != none) {
       variable = fixed;
-      // The end of a packet is no instant that its events follow.
+      // The events of a packet happen before its end, so that must not set the clock.
       sets_clock = sets_clock && variable != timestamp_end;
     } else if (trace_->referenced.contains(name)) {
       variable = variables_++;
     }
-    place.frames.back()->note(name, {variable, &integer});
+    place.frames.back()->declare(name, {variable, &integer});
     if (place.column == none && variable == none && !sets_clock) {
       skip(integer.align, integer.size);
       return integer.size;
     }
-    // Whether its bytes are the same in a packet and in its column.
-    const bool alike = integer.align >= 8 && integer.size >= 8 &&
-                       std::has_single_bit(static_cast<std::uint64_t>(integer.size)) &&
-                       (integer.size == 8 || !integer.big_endian);
-    const bool moved = alike && !sets_clock && variable == none;
-    add({.does = moved ? Step::Does::move : Step::Does::number,
+    // Whether its bytes in a packet are those in its column.
+    const bool same_bytes = integer.align >= 8 && integer.size >= 8 &&
+                            std::has_single_bit(static_cast<std::uint64_t>(integer.size)) &&
+                            (integer.size == 8 || !integer.big_endian);
+    const bool is_moved = same_bytes && !sets_clock && variable == none;
+    add({.does = is_moved ? Step::Does::move : Step::Does::number,
          .is_signed = integer.is_signed,
          .big_endian = integer.big_endian,
          .sets_clock = sets_clock,
@@ -277,19 +283,21 @@ private:
     return product(step.count, least);
   }
 
-  // What becomes of a loop and the steps of its element, from `first` on: nothing but a skip where
-  // all that the element does is to be skipped.
+  // Ends a loop whose element has the steps from `first` on. Where an element is just skipped, the
+  // loop becomes a single step that skips all elements.
   void close_loop(std::size_t loop, std::size_t first, std::int64_t least) {
-    const Step only = steps().size() == first + 1 ? steps()[first] : steps()[loop];
-    const bool even = only.does == Step::Does::skip && only.size % only.align == 0;
-    if (even && (steps()[loop].variable == none || only.size == 0)) {
+    const bool single = steps().size() == first + 1;
+    const Step element = single ? steps()[first] : steps()[loop];
+    // Elements stand without gaps only if their size is a multiple of their alignment.
+    const bool is_skipped = element.does == Step::Does::skip && element.size % element.align == 0;
+    if (is_skipped && (steps()[loop].variable == none || element.size == 0)) {
       const auto count = steps()[loop].count, align = steps()[loop].align;
       steps().resize(loop);
-      skip(std::max(align, only.align), product(only.size, count));
-    } else if (even) {
+      skip(std::max(align, element.align), product(element.size, count));
+    } else if (is_skipped) {
       steps().resize(first);
       steps()[loop].does = Step::Does::skip_many;
-      steps()[loop].size = only.size;
+      steps()[loop].size = element.size;
     } else {
       add({.does = Step::Does::again, .target = first});
       steps()[loop].target = steps().size();
@@ -299,7 +307,7 @@ private:
   }
 
 public:
-  // What it costs at most to run steps once, the turns of their loops aside.
+  // Returns what it costs at most to run steps once, without the turns of their loops.
   std::int64_t cost(Steps run) const {
     std::size_t cost = run.end - run.first;
     for (auto index = run.first; index < run.end; ++index)
@@ -331,12 +339,14 @@ private:
       jumps.push_back(add({.does = Step::Does::jump}));
     }
     for (const auto jump : jumps) steps()[jump].target = steps().size();
+    // Until here the target of a range was the number of its option.
     for (auto range = first; range < last; ++range)
       ranges[range].target = begins[ranges[range].target];
     return least;
   }
 
-  // The tags that choose an option; LTTng writes its name with or without an underscore.
+  // Adds the tags that choose the option of this number. LTTng writes an option's name with or
+  // without a leading underscore.
   void add_ranges(const Integer & tag, const std::string & option, std::size_t number) {
     for (const bool bare : {false, true}) {
       if (bare && (option.empty() || option[0] != '_')) continue;
@@ -347,7 +357,9 @@ private:
     }
   }
 
-  // The number that a length or tag names, relative or absolute (7.3.2).
+  // Returns the number that the path of a length or tag names (7.3.2): an absolute path begins with
+  // a scope; a relative one is searched from the innermost frame outwards, then in the scopes, the
+  // latest one first.
   Number referred(const std::string & path, const Place & place) const {
     const std::string_view names = path;
     for (const auto & [scope, frame] : roots_)
@@ -361,12 +373,13 @@ private:
                                 "' names no number that is read before it");
   }
 
+  // Appends a step; returns its number.
   std::size_t add(const Step & step) {
     steps().push_back(step);
     return steps().size() - 1;
   }
 
-  // Skips bits, in one step with what is skipped before where that is alike.
+  // Appends a skip, or makes the skip before longer where that comes to the same.
   void skip(std::int64_t align, std::int64_t size) {
     size = std::min(size, endless_bits);
     if (steps().size() > start_) {
@@ -391,7 +404,8 @@ private:
 
 // Event and stream classes
 
-// Notes whether an event is of constant layout, and what moves where if that is all to be done.
+// Finds out whether an event is of constant layout; and if bytes only have to be moved to its
+// columns, which ones.
 void note_constant_layout(const Layout & layout, EventLayout & event) {
   std::int64_t align = 1, position = 0;
   bool moves_only = true;
@@ -417,7 +431,7 @@ void note_constant_layout(const Layout & layout, EventLayout & event) {
   if (event.is_moved) event.moves = std::move(moves);
 }
 
-// Notes the form of the header that LTTng writes; leaves every other one to its steps.
+// Returns the form of a header that LTTng writes; `align` 0: it is another, which its steps read.
 QuickHeader quick_header(const std::optional<Structure> & header, bool big_endian) {
   if (!header || header->fields.size() != 2 || header->fields[0].name != "id" || big_endian)
     return {};
@@ -444,8 +458,8 @@ QuickHeader quick_header(const std::optional<Structure> & header, bool big_endia
   return {header->align, id->size, shift, clock->size};
 }
 
-// Where LTTng's context has the process and the thread; 0s where not both are of 32 bits at a
-// constant place.
+// Returns where LTTng's context has the process and the thread; zeros: they are not both of 32 bits
+// and at constant places.
 ProcessPlace process_place(const StreamClass & stream) {
   if (!stream.event_context) return {};
   std::int64_t position = 0, process = none, thread = none;
@@ -469,13 +483,15 @@ ProcessPlace process_place(const StreamClass & stream) {
   return {stream.event_context->align, process, thread};
 }
 
+// Returns the structure of a scope of an event; none: it has no such scope.
 const std::optional<Structure> & structure_of(const StreamClass & stream, const EventClass & event,
                                               Scope scope) {
   if (scope == Scope::stream_event_context) return stream.event_context;
   return scope == Scope::event_context ? event.context : event.fields;
 }
 
-// The column of each field of a scope, and its table's shape.
+// Returns number of a field → its column, for the fields of a scope; sets the widths of the
+// columns.
 std::map<std::size_t, std::int32_t> columns_of(const WantedEvent & wanted, Scope scope,
                                                const std::optional<Structure> & structure,
                                                std::vector<std::int64_t> & widths) {
@@ -495,14 +511,14 @@ std::map<std::size_t, std::int32_t> columns_of(const WantedEvent & wanted, Scope
   return columns;
 }
 
-// Notes the table that an event goes to; all events of a table must have the same columns.
+// Sets the table that an event goes to; all events of a table must have the same columns.
 void join_table(Layout & layout, EventLayout & event, const WantedEvent & wanted,
                 TableLayout table) {
   const auto number = static_cast<std::size_t>(wanted.table);
   if (wanted.table < 0 || number > layout.tables.size())
     throw std::invalid_argument("tables are counted in order of their first event");
   for (const auto width : table.widths) event.cost += width;
-  event.cost += 8 + 4 * static_cast<int>(table.has_cpu);
+  event.cost += 8 + (table.has_cpu ? 4 : 0);  // the time and the core
   event.table = wanted.table;
   if (number == layout.tables.size()) {
     layout.tables.push_back(std::move(table));
@@ -532,6 +548,7 @@ void add_event(Layout & layout, Writer writer, const StreamClass & stream, bool 
   layout.events.push_back(std::move(event));
 }
 
+// Sets the event class of each id: of small ids in a vector, of others in a sorted list.
 void note_ids(StreamLayout & row, std::vector<std::pair<std::int64_t, std::int32_t>> ids) {
   if (ids.size() == 1) row.default_event = ids[0].first;
   std::sort(ids.begin(), ids.end());
@@ -542,6 +559,25 @@ void note_ids(StreamLayout & row, std::vector<std::pair<std::int64_t, std::int32
     } else {
       row.rare_events.emplace_back(id, event);
     }
+  }
+}
+
+// An event's span is known if its layout is constant, and its start is aligned wherever the
+// header's is.
+void note_spans(const Layout & layout, StreamLayout & row) {
+  if (row.quick.align == 0) return;
+  for (const auto number : row.events) {
+    QuickEvent quick{number, 0};
+    if (number != none) {
+      const EventLayout & event = layout.events[static_cast<std::size_t>(number)];
+      if (event.align != 0 && row.quick.align % event.align == 0) {
+        const auto behind = row.quick.clock_shift + row.quick.clock_bits;
+        const auto span = ((behind + event.align - 1) & -event.align) + event.size;
+        if (span <= std::numeric_limits<std::int32_t>::max())
+          quick.span = static_cast<std::int32_t>(span);
+      }
+    }
+    row.quick_events.push_back(quick);
   }
 }
 
@@ -576,6 +612,7 @@ void add_stream(Layout & layout, const TraceClass & trace, const StreamClass & s
     add_event(layout, header.following(false), stream, row.knows(cpu_id), header_cost, event, wish);
   }
   note_ids(row, std::move(ids));
+  note_spans(layout, row);
   layout.streams.push_back(std::move(row));
 }
 

@@ -1,9 +1,9 @@
-// How the bits of packets lie: what `lay_out` makes of a trace's types for the decoder to run.
+// Where the bits of packets are: `lay_out` turns a trace's types into steps that the decoder runs.
 //
-// The types of a scope (a header, a context, an event's fields) become a list of steps. Runs of
-// fixed size that nobody asked for become one step, and events of constant layout need no steps at
-// all: what is asked for lies at known places in them. Positions are bits from the start of a
-// packet.
+// The types of a scope (a header, a context, an event's fields) become a list of steps. Fields of
+// fixed size in a row, of which none is wanted, become a single step. Events of constant layout
+// need no steps at all: their wanted fields are at known places. Positions are bits from the start
+// of a packet.
 
 #pragma once
 
@@ -21,8 +21,9 @@
 
 namespace chainshaper::ctf {
 
-// Numbers that steps note for later steps, or for the decoder. The first ones are fields of the
-// packet header and packet context. Lengths and tags to which types refer follow.
+// Numbers that steps store for later steps, or for the decoder. The first ones are the fields of
+// the packet header and packet context that are named here. Behind them come the lengths and tags
+// to which types refer.
 enum Variable : std::uint8_t {
   event_id,
   magic,
@@ -46,13 +47,13 @@ struct Step {
   enum class Does : std::uint8_t {
     skip,        // `size` bits
     number,      // reads an integer
-    move,        // reads an integer of 8, 16, 32 or 64 bits that lies in the packet as in memory
+    move,        // reads an integer of 8, 16, 32 or 64 bits with the same bytes as in memory
     text,        // reads bytes up to a NUL
     characters,  // reads `count` bytes; of a text only those before a NUL
     skip_many,   // `count` elements of `size` bits
     loop,        // runs the steps behind it `count` times, then goes on at `target`
     again,       // the end of a loop's turn; `target` is its first step
-    choose,      // goes on where the range of a tag says
+    choose,      // goes on at the target of the range that a tag is in
     jump,        // goes on at `target`
   };
 
@@ -61,15 +62,15 @@ struct Step {
   bool big_endian{false};
   bool sets_clock{false};
   bool is_text{false};
-  std::int32_t variable{none};  // set by a number; or it has the `count`, or the tag of `choose`
+  std::int32_t variable{none};  // that is set by a number; or has `count`, or the tag of `choose`
   std::int32_t column{none};    // column of the event's table to which the value goes
   std::int64_t align{1};        // bits
   std::int64_t size{0};         // bits
-  std::int64_t count{0};        // if it is constant, so that no variable has it
+  std::int64_t count{0};        // if it is constant, else `variable` has it
   std::size_t target{0};        // a step
   std::size_t first_range{0};   // of `choose`: its first one in Layout::ranges
   std::size_t ranges{0};        // of `choose`: how many it has
-  std::int64_t least{0};        // the least bits of an element of a loop
+  std::int64_t least{0};        // the fewest bits that an element of a loop takes
   std::int64_t cost{0};         // of an element of a loop, see run.hpp
 };
 
@@ -79,41 +80,48 @@ struct Steps {
   std::size_t end{0};
 };
 
-// Tags from `low` to `high`, as `Integer::ordered` has them, choose the step `target`.
+// Tags from `low` to `high`, as `Integer::ordered` returns them, choose the step `target`.
 struct TagRange {
   std::uint64_t low;
   std::uint64_t high;
   std::size_t target;
 };
 
-// A value that lies at a constant place in an event and goes to a column.
+// A value at a constant place in an event, which goes to a column.
 struct Move {
   std::int64_t offset;  // bytes from the aligned start of the event's contexts and payload
   std::int64_t length;  // bytes
   std::int32_t column;  // of the event's table
-  bool is_characters;   // its column has the code of a text, else the bytes themselves
+  bool is_characters;   // the column gets the code of a text, else the bytes themselves
   bool is_text;         // characters that end at a NUL
 };
 
 struct EventLayout {
-  // What pass 1 needs of an event of constant layout, which it passes over in one step:
-  std::int64_t align{0};  // 0: the layout is not constant
-  std::int64_t size{0};
+  // Pass 1 steps over an event of constant layout at once, by these two:
+  std::int64_t align{0};     // 0: the layout is not constant
+  std::int64_t size{0};      // bits
   std::int64_t cost{0};      // of header and steps, and the bytes of a row
-  std::int32_t table{none};  // to which it goes
+  std::int32_t table{none};  // that it goes to; none: it is not wanted
   bool is_moved{false};      // whether pass 2 needs only `moves`, not `steps`
   Steps steps;               // of contexts and payload
   std::vector<Move> moves;
 };
 
 // LTTng's compact or large event header, if a stream has one: an id of few bits, then the clock's
-// low bits, which a single load reads. An id of all ones announces the long form, which the steps
-// read.
+// low bits, both of which are read at once. An id of all ones announces the long form of the
+// header, which is read by its steps.
 struct QuickHeader {
   std::int64_t align{0};  // 0: the stream has another header
   std::int64_t id_bits{0};
   std::int64_t clock_shift{0};
   std::int64_t clock_bits{0};
+};
+
+// What follows a quick header with some id. Stepping from one event to the next waits for little
+// more than to load this.
+struct QuickEvent {
+  std::int32_t event{none};  // class
+  std::int32_t span{0};  // bits from the header's aligned start to the event's end; 0: not known
 };
 
 // Where the process and the thread of an event are, as 32 bits each: bits from where the event's
@@ -133,10 +141,11 @@ struct StreamLayout {
   ProcessPlace process;
   std::int64_t frequency_hz;
   std::int64_t packet_cost;
-  std::int64_t default_event{0};  // the id of all events, if they say none
+  std::int64_t default_event{0};  // the id of events whose header has none
   std::uint32_t known{0};         // bit n: packets have Variable n
   std::pair<std::int64_t, std::int64_t> uuid{0, 0};
-  std::vector<std::int32_t> events;  // event class by small id, or `none`
+  std::vector<std::int32_t> events;      // event class by small id, or `none`
+  std::vector<QuickEvent> quick_events;  // the same, of streams with a quick header
   std::vector<std::pair<std::int64_t, std::int32_t>> rare_events;  // large id and class, ascending
 
   bool knows(Variable variable) const { return (known >> variable & 1) != 0; }
@@ -152,7 +161,7 @@ private:
   std::int32_t rare_event(std::int64_t id_of_event) const;
 };
 
-// The dynamic scopes that steps behind an event's header are of.
+// The dynamic scopes behind an event's header.
 enum class Scope : std::uint8_t { stream_event_context, event_context, event_fields };
 
 // A field that gets a column: its number in the structure of its scope.
@@ -161,17 +170,18 @@ struct ColumnField {
   std::size_t field;
 };
 
-// An event class that is asked for; classes are counted over all traces, in order of declaration.
+// An event class that is wanted; classes are numbered over all traces, in order of declaration.
 struct WantedEvent {
   std::size_t event;
   std::int32_t table;
-  std::vector<ColumnField> columns;  // in the order in which the fields lie
+  std::vector<ColumnField> columns;  // in the order in which the fields are recorded
 };
 
-// Tables that wanted events go to. `widths` are the bytes of a value of each column: the next power
-// of two for an integer, 4 for the code of a text.
+// A table that wanted events go to.
 struct TableLayout {
   bool has_cpu;
+  // The bytes of a value of each column: for an integer the next power of two, for a text 4, since
+  // its column has codes.
   std::vector<std::int64_t> widths;
 };
 
@@ -191,7 +201,8 @@ struct Layout {
   }
 };
 
-// Larger sizes are cut to this one, which no packet has. The sum of two of them does not overflow.
+// Stands for all larger sizes: no packet has so many bits. The sum of two of them does not
+// overflow.
 inline constexpr std::int64_t endless_bits = std::int64_t{1} << 56;
 
 // Thrown if a trace cannot be laid out: a length or tag is no number, types are nested too deeply,

@@ -9,7 +9,7 @@
 namespace chainshaper::ctf {
 namespace {
 
-// So many damaged places of a file are read on behind.
+// After so many damaged places the rest of a file is not read.
 constexpr std::size_t most_damaged = 1000;
 
 class Search {
@@ -23,7 +23,8 @@ public:
     run_.set_budget(budget_per_byte * static_cast<std::int64_t>(file.size()));
   }
 
-  // Lists packets from `offset` on, up to the end of the file (no damage) or what is none.
+  // Lists packets from `offset` on. Returns the first place that is no whole packet; none: the end
+  // of the file was reached.
   std::optional<DamagedPlace> read_from(std::int64_t offset, std::vector<Packet> & packets) {
     const auto size = static_cast<std::int64_t>(file_.size());
     while (offset < size) {
@@ -40,7 +41,7 @@ public:
   }
 
 private:
-  // Reads a packet's header and context. Its sizes are as it says, if these are possible.
+  // Reads a packet's header and context. Its sizes are those that it has itself, if possible ones.
   std::optional<Damage> read(std::int64_t offset, Packet & packet) {
     const auto bytes = file_.subspan(static_cast<std::size_t>(offset));
     const Content content{bytes, static_cast<std::int64_t>(8 * bytes.size())};
@@ -58,8 +59,8 @@ private:
       return each.id == run_.variable(stream_id);
     });
     if (stream == streams_.end()) return Damage::bad_stream;
-    const auto passed = stream - streams_.begin();
-    if (!run_.afford(stream->packet_cost + passed + variables_cost_)) return Damage::costly;
+    const auto number = stream - streams_.begin();
+    if (!run_.afford(stream->packet_cost + number + variables_cost_)) return Damage::costly;
     const auto context = run_.steps(stream->packet_context, content, header.bits());
     if (context.failed()) return Damage::bad_header;
     const auto bits = known_or(*stream, packet_size, content.end);
@@ -69,7 +70,7 @@ private:
     packet = {.offset = offset,
               .size = bits >> 3,
               .content_bits = content_bits,
-              .stream_class = static_cast<std::int64_t>(first_stream_) + passed,
+              .stream_class = static_cast<std::int64_t>(first_stream_) + number,
               .instance = known_or(*stream, stream_instance_id, -1),
               .begin = known_or(*stream, timestamp_begin, -1),
               .end = known_or(*stream, timestamp_end, -1),
@@ -87,11 +88,11 @@ private:
   std::span<const StreamLayout> streams_;
   std::size_t first_stream_;
   Bytes file_;
-  std::int64_t variables_cost_;  // of forgetting them at the beginning of a packet
+  std::int64_t variables_cost_;  // what it costs to forget all variables before a packet
   Run run_;
 };
 
-// Where `content` lies in a file from `start` on; -1 for nowhere.
+// Returns the first place of `content` in a file from `start` on; -1: there is none.
 std::int64_t find(Bytes file, Bytes content, std::int64_t start) {
   const auto from = file.begin() + std::min(start, static_cast<std::int64_t>(file.size()));
   const auto place = std::search(

@@ -67,7 +67,7 @@ Reached Run::steps(Steps steps, const Content & content, std::int64_t position, 
   return position;
 }
 
-// Reads an integer or the bits of a float; the caller has checked the end.
+// Reads an integer, or the bits of a float. The caller has checked that they end in the content.
 void Run::read_number(const Step & step, Bytes bytes, std::int64_t position, const Row * row) {
   const auto bits = bits_at(bytes, position, step.size, step.big_endian);
   const auto value = step.is_signed ? with_sign(bits, step.size) : static_cast<std::int64_t>(bits);
@@ -77,7 +77,7 @@ void Run::read_number(const Step & step, Bytes bytes, std::int64_t position, con
   if (step.sets_clock) set_clock(bits, step.size);
 }
 
-// Reads a string, or an array of characters or bytes; the position behind it.
+// Reads a string, or an array of characters or bytes; returns where it ends.
 Reached Run::read_text(const Step & step, const Content & content, std::int64_t position,
                        const Row * row) {
   const bool is_open = step.does == Step::Does::text;
@@ -101,7 +101,7 @@ Reached Run::read_text(const Step & step, const Content & content, std::int64_t 
   return limit << 3;
 }
 
-// Skips many elements, or begins the turns of a loop; the position behind.
+// Skips many elements, or begins the turns of a loop; returns the position after that.
 Reached Run::repeat(const Step & step, std::int64_t end, std::int64_t position) {
   const bool is_loop = step.does == Step::Does::loop;
   const auto count = step.variable == none ? step.count : variable(step.variable);
@@ -115,7 +115,7 @@ Reached Run::repeat(const Step & step, std::int64_t end, std::int64_t position) 
   return position;
 }
 
-// The range that the tag of a variant is in; nullptr for none.
+// Returns the range that the tag of a variant is in; nullptr: it is in none.
 const TagRange * Run::chosen(const Step & step) const {
   const auto bits = static_cast<std::uint64_t>(variable(step.variable));
   const auto tag = step.is_signed ? bits ^ (std::uint64_t{1} << 63) : bits;

@@ -1,8 +1,9 @@
-// Running the steps of a layout over the bits of a packet.
+// Runs the steps of a layout over the bits of a packet.
 //
 // Every step checks the end of the packet's content before it reads, and every load checks the end
-// of the file. Fields of no bits, whose number a packet says itself, could keep a core busy for
-// hours. So when packets are read for the first time, each step is paid from a budget.
+// of the file. A hostile packet may say that it has very many fields of no bits, which would keep a
+// core busy for hours. So when a packet is read for the first time, each step is paid from a
+// budget.
 
 #pragma once
 
@@ -31,7 +32,7 @@ enum class Failure : std::uint8_t {
   table_full,     // more events than were counted
 };
 
-// How far reading came: bits from the packet's start, or why not further.
+// How far reading came, in bits from the packet's start; or why it failed.
 class Reached {
 public:
   // NOLINTNEXTLINE(google-explicit-constructor): a position is the usual case
@@ -90,11 +91,11 @@ struct Row {
   Texts * texts;
 };
 
-// What may be spent for each byte of a packet or, in finding packets, for each byte of a file. A
-// step costs 1. A byte of a column costs 1 as well, or fields of no bits could fill the memory.
+// The budget for each byte of a packet; when packets are searched, for each byte of the file. A
+// step costs 1. A byte of a column costs 1, too: otherwise fields of no bits could fill the memory.
 inline constexpr std::int64_t budget_per_byte = 64;
 
-// Reads one packet after the other: the clock, the variables and the budget go on.
+// Reads packet after packet, with a clock, variables and a budget that go on from one to the next.
 class Run {
 public:
   explicit Run(const Layout & layout)
@@ -104,21 +105,22 @@ public:
   Reached steps(Steps steps, const Content & content, std::int64_t position,
                 const Row * row = nullptr);
 
-  // Sets the low `size` bits of the clock. It wraps forward only (section 8).
+  // Sets the low `size` bits of the clock. If they have become smaller, they have wrapped: the
+  // clock only goes forward (section 8).
   void set_clock(std::uint64_t value, std::int64_t size) {
     const auto before = clock_;
     clock_ = size >= 64 ? value : (before - low_bits(before, size)) | value;
     if (size < 64 && value < low_bits(before, size)) clock_ += std::uint64_t{1} << size;
   }
 
-  // Spends some of the budget; whether it lasts.
+  // Takes a cost from the budget; returns whether there was enough.
   bool afford(std::int64_t cost) {
     if (__builtin_sub_overflow(budget_, cost, &budget_)) budget_ = -1;
     return budget_ >= 0;
   }
 
-  // Forgets what was read. A packet begins with this: a length or tag in an option that was not
-  // chosen must not depend on what stood in other packets, of which not all are read each time.
+  // Sets all variables to 0. Every packet begins with this: a length or tag in an option that was
+  // not chosen must not have its value from another packet, which may not be read every time.
   void forget_variables() { std::fill(variables_.begin(), variables_.end(), 0); }
 
   std::uint64_t clock() const { return clock_; }
@@ -140,7 +142,7 @@ private:
 
   const Layout & layout_;
   std::vector<std::int64_t> variables_;
-  std::vector<std::int64_t> turns_;  // of loops that are run, the innermost last
+  std::vector<std::int64_t> turns_;  // that remain of each open loop, the innermost last
   std::uint64_t clock_{0};
   std::int64_t budget_{std::numeric_limits<std::int64_t>::max()};
 };

@@ -1,4 +1,4 @@
-// Texts and bytes as numbers: each different one is kept once, and columns have its code.
+// Numbers for texts and arrays of bytes: equal ones have the same code, and columns have codes.
 
 #pragma once
 
@@ -9,27 +9,28 @@
 
 namespace chainshaper::ctf {
 
-// A text or bytes in a packet: where, how long, and what they are looked up by.
+// A text, or an array of bytes, in a packet.
 struct Text {
   const std::uint8_t * place;
   std::int64_t length;      // bytes
-  std::uint64_t digest;     // of its words
-  std::uint64_t last_word;  // its last 8 bytes or fewer, from a multiple of 8 on, then 0s
+  std::uint64_t digest;     // a hash of its words of 8 bytes
+  std::uint64_t last_word;  // the bytes behind the last full word, 0 to 7, then zeros
 };
 
-// Reads the characters of `bytes` from byte `at` to `limit`, which is not before it; of a text only
-// those before the first NUL. What lies at the limit and behind it counts as NULs.
+// Reads the characters of `bytes` from byte `at` up to `limit`, which is not before it; of a text
+// only those before the first NUL. Bytes from the limit on count as NULs.
 inline Text text_at(Bytes bytes, std::int64_t at, std::int64_t limit, bool is_text) {
   constexpr std::uint64_t ones = 0x0101010101010101, highs = 0x8080808080808080;
   constexpr std::uint64_t factor = 0x9E3779B97F4A7C15;
   Text text{bytes.data() + at, limit - at, factor, 0};
-  // The last word is the first one that is not full, be it empty.
+  // The last word is the first word that is not full; it may be empty.
   bool is_last = false;
   for (auto place = at; !is_last; place += 8) {
     auto word = word_at(bytes, place);
     is_last = place + 8 > limit;
     if (is_last) word = low_bits(word, 8 * (limit - place));
-    // The top bit of each byte that is 0, and of others only behind the first of these.
+    // Has the top bit of each byte that is 0. Behind the first such byte it may have top bits of
+    // other bytes, too.
     const auto zeros = is_text ? (word - ones) & ~word & highs : 0;
     if (zeros != 0) {
       is_last = true;
@@ -43,11 +44,11 @@ inline Text text_at(Bytes bytes, std::int64_t at, std::int64_t limit, bool is_te
   return text;
 }
 
-// The dictionary of one run of the decoder. The bytes of texts stay where they are, in the packets,
-// which have to live as long.
+// The dictionary of a run of the decoder. The bytes of texts stay in their packets, which must live
+// as long.
 class Texts {
 public:
-  // The code of a text; codes count up from 0 in order of first use.
+  // Returns the code of a text; codes count up from 0 in order of first use.
   std::uint32_t code(const Text & text) {
     auto slot = first_slot(text);
     for (; slots_[slot] != 0; slot = (slot + 1) & mask()) {
@@ -66,8 +67,8 @@ private:
     return static_cast<std::size_t>(text.digest >> 32) & mask();
   }
 
-  // Words up to the last one are compared. That one is the same where the digests are, since a
-  // digest has a different value for each word that is added to the same ones before.
+  // Compares all words but a full word at the end of the text. That one is the same if the digests
+  // are: after equal words, a different word gives a different digest.
   static bool same(const Text & known, const Text & text) {
     if (known.digest != text.digest || known.length != text.length ||
         known.last_word != text.last_word)
@@ -96,7 +97,7 @@ private:
   }
 
   std::vector<Text> texts_;  // by code
-  // 1 + the code, 0 where a place is free; a power of two, at least half of them are free.
+  // 1 + the code, or 0: free. Their number is a power of two, and at least half of them are free.
   std::vector<std::uint32_t> slots_ = std::vector<std::uint32_t>(1024);
 };
 

@@ -51,7 +51,7 @@ std::int64_t alignment(const Type & type) {
 }
 
 Type checked(Kind kind) {
-  std::visit([](const auto & given) { check(given); }, kind.is);
+  std::visit([](const auto & type) { check(type); }, kind.is);
   return std::make_shared<const Kind>(std::move(kind));
 }
 

@@ -1,7 +1,7 @@
 // What a trace's metadata declares (Common Trace Format 1.8, sections 4 and 7): types of fields,
 // and the classes of streams and events that are made of them. Sizes and alignments are in bits.
 //
-// Nobody has to have checked the numbers: `checked` (below) refuses those that cannot be.
+// Numbers need not be checked before: `checked` (below) refuses impossible ones.
 
 #pragma once
 
@@ -19,7 +19,7 @@ namespace chainshaper::ctf {
 
 struct Kind;
 
-// A type of field. Types are shared: one that is declared once and used often is here once.
+// A type of fields. Fields whose type is declared once share it.
 using Type = std::shared_ptr<const Kind>;
 
 struct Field {
@@ -27,7 +27,7 @@ struct Field {
   Type type;
 };
 
-// Values of an enumeration, both ends included. Numbers are in the order of `ordered`.
+// Values of an enumeration, both ends included, as `Integer::ordered` returns them.
 struct Range {
   std::uint64_t low;
   std::uint64_t high;
@@ -39,10 +39,11 @@ struct Integer {
   std::int64_t align;
   bool is_signed;
   bool big_endian;
-  bool maps_clock;                                   // its value is the clock's low bits
+  bool maps_clock;                                   // its value is the low bits of the clock
   std::map<std::string, std::vector<Range>> labels;  // of an enumeration
 
-  // Numbers of this type as unsigned ones in the same order: the top bit of signed ones is turned.
+  // Returns an unsigned number for each value of this type, in the same order: the top bit of a
+  // signed value is inverted.
   std::uint64_t ordered(std::uint64_t bits) const {
     return is_signed ? bits ^ (std::uint64_t{1} << 63) : bits;
   }
@@ -50,11 +51,11 @@ struct Integer {
 
 struct String {};  // bytes up to and with the first NUL (4.2.5)
 
-// An array, or a sequence, whose length is a field that stands before it (4.2.3, 4.2.4).
+// An array, or a sequence, whose length is the value of a field before it (4.2.3, 4.2.4).
 struct Array {
   Type element;
   std::variant<std::int64_t, std::string>
-      length;    // elements, or the path of the field that says it
+      length;    // the number of elements, or the path of the field that has it
   bool is_text;  // of characters: a text ends at the first NUL
 };
 
@@ -64,7 +65,7 @@ struct Structure {  // 4.2.1
 };
 
 struct Variant {                   // 4.2.2
-  std::optional<std::string> tag;  // the path of the enumeration that chooses
+  std::optional<std::string> tag;  // the path of the enumeration that chooses an option
   std::vector<Field> options;
 };
 
@@ -89,7 +90,7 @@ struct StreamClass {
 
 struct TraceClass {
   bool big_endian;
-  bool of_kernel;  // threads of a kernel trace may have the number 0
+  bool of_kernel;  // in a kernel trace, 0 is a valid number of a thread
   std::optional<std::pair<std::int64_t, std::int64_t>>
       uuid;  // its bytes as two little-endian words
   std::optional<Structure> packet_header;
@@ -97,10 +98,10 @@ struct TraceClass {
   std::vector<StreamClass> streams;
 };
 
-// The alignment of a type; a variant has none of its own.
+// Returns the alignment of a type; a variant has none: 1.
 std::int64_t alignment(const Type & type);
 
-// Throws std::invalid_argument for a size, an alignment or a length that cannot be.
+// Returns a type. Throws std::invalid_argument for an impossible size, alignment or length.
 Type checked(Kind kind);
 
 }  // namespace chainshaper::ctf

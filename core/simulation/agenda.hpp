@@ -21,13 +21,14 @@ struct Expiry {
 struct Delivery {
   Message * message;
 };
-// A thread has slept for as long as it wanted.
+// A sleep of a thread is over.
 struct SleepOver {
   Thread * thread;
 };
 using Happening = std::variant<Expiry, Delivery, SleepOver>;
 
-// Happenings at the same time come in the order in which they were planned.
+// Gives happenings in order of time; those of the same time in the order in which they were
+// planned.
 class Agenda {
 public:
   void plan(Nanoseconds time, Happening happening) { coming_.push({time, planned_++, happening}); }

@@ -9,7 +9,7 @@ bool Engine::begin_body(Thread & thread) {
   const Entity & entity = *thread.entity;
   thread.publication = 0;
   thread.step = Step::publish;
-  switch (entity.given->body) {
+  switch (entity.description->body) {
     case Body::gate:
       return enter_gate(thread);
     case Body::mode_listener:
@@ -25,7 +25,7 @@ bool Engine::begin_body(Thread & thread) {
   return true;
 }
 
-// Publishes on the next topic, or computes what comes behind them, or ends the callback.
+// Publishes with the next publisher; after the last one computes again, or ends the callback.
 bool Engine::go_on_publishing(Thread & thread) {
   const Entity & entity = *thread.entity;
   const std::size_t place = thread.publication++;
@@ -46,14 +46,14 @@ Nanoseconds Engine::computing_time(Stream & stream) {
   constexpr Nanoseconds million = 1'000'000;
   const Nanoseconds time = draw(stream);
   Nanoseconds product = 0;
-  if (!__builtin_mul_overflow(time, given_.interrupts_ppm, &product))
+  if (!__builtin_mul_overflow(time, description_.interrupts_ppm, &product))
     return later(time, product / million);
-  const auto longer = static_cast<__int128>(time) * given_.interrupts_ppm / million;
+  const auto longer = static_cast<__int128>(time) * description_.interrupts_ppm / million;
   return later(time, longer < forever ? static_cast<Nanoseconds>(longer) : forever);
 }
 
 bool Engine::end(Thread & thread) {
-  log(TracePoint::callback_end, now_, &thread, {thread.entity->given->callback, thread.used});
+  log(TracePoint::callback_end, now_, &thread, {thread.entity->description->callback, thread.used});
   return false;
 }
 
@@ -68,13 +68,13 @@ bool has_set(const Synchroniser & synchroniser) {
 
 }  // namespace
 
-// Adds the message to its synchroniser's input; whether that completes a set.
+// Adds the thread's message to its input of the synchroniser; returns whether a set is complete.
 //
-// A set has the oldest message of every input, and the stamp of the first one's. Where one input
-// triggers, the others have their newest one only, which stays for the next message of that input.
+// A set has the oldest message of every input, and the stamp of the first input's message. With a
+// trigger, the other inputs have only their newest message, which stays there for the next set.
 bool Engine::complete(Thread & thread) {
   Synchroniser & synchroniser = *thread.entity->synchroniser;
-  const Place place = thread.entity->given->input;
+  const Place place = thread.entity->description->input;
   Synchroniser::Input & input = synchroniser.inputs[place];
   Message & added = new_message();
   added.carried = thread.carried;

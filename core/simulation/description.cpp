@@ -10,7 +10,7 @@ void require(bool sound, const char * problem) {
   if (!sound) throw std::invalid_argument(std::string("a simulation cannot have ") + problem);
 }
 
-// A sum of a few times of this size can be held.
+// Times are so small that the sum of a few of them does not overflow.
 bool is_time(Nanoseconds value) { return value >= 0 && value <= forever; }
 
 template <typename Listed>
@@ -91,7 +91,7 @@ void check_gate(const GateDescription & described) {
   }
 }
 
-// Every process has threads where something is to be done in them.
+// Checks that processes have their callbacks, and the threads that these need.
 void check_processes(const Description & all) {
   std::vector<bool> executing(all.processes.size()), sending(all.processes.size());
   for (const auto & thread : all.threads) {

@@ -1,8 +1,8 @@
 // What is simulated: an application's processes, threads, callbacks and topics, as plain values.
 //
 // Parts refer to each other by their places in the lists of a `Description`. Python fills it in
-// (chainshaper/simulation/machine.py) and `check` refuses a contradictory one. All times are
-// nanoseconds of the only clock that a simulated machine has.
+// (chainshaper/simulation/machine.py) and `check` refuses a contradictory one. A simulated machine
+// has a single clock; all times are its nanoseconds.
 
 #pragma once
 
@@ -23,14 +23,14 @@ using MaybePlace = std::optional<Place>;
 // Later than anything that happens.
 inline constexpr Nanoseconds forever = 0x4000'0000'0000'0000;
 
-// From an offset in the cycle on, these servers of a core are open; bit n stands for server n.
+// Which servers of a core are open from an offset in the cycle on: bit n stands for server n.
 struct OpenServers {
   Nanoseconds offset_ns;
   std::uint64_t servers;
 };
 
 struct CoreDescription {
-  std::vector<OpenServers> table;    // in force again and again; empty: no plan governs this core
+  std::vector<OpenServers> table;    // in force in every cycle; empty: no plan governs this core
   std::uint64_t open_servers{0};     // at the start
   Place next{0};                     // the row of the table that comes into force next
   Nanoseconds boundary_ns{forever};  // when it does
@@ -42,18 +42,18 @@ enum class Role { executor, publisher, dds };
 
 struct ThreadDescription {
   Place core{0};
-  std::int64_t rank{0};               // the smaller one runs
-  std::optional<std::size_t> server;  // of its core; none: it runs at any time
+  std::int64_t rank{0};               // the thread of the smallest rank runs
+  std::optional<std::size_t> server;  // number of its server on its core; none: it runs any time
   Role role{Role::executor};
   Place process{0};
   // Streams of CPU times:
-  Place wake_up{0};    // from being woken to being at work
-  Place take{0};       // from choosing a message to the beginning of its callback
+  Place wake_up{0};    // after it is woken, until it goes on with its work
+  Place take{0};       // after it has chosen a message, until the callback begins
   Place publish{0};    // of publishing a message, or of sending it
-  MaybePlace receive;  // of receiving a message; threads of DDS have it
+  MaybePlace receive;  // of receiving a message; only threads of DDS have it
   // Stream of delays:
   Place delivery{0};  // from sending a message until it is at the subscriber's process
-  // In its events:
+  // Numbers that its events have:
   std::int32_t pid{0};
   std::int32_t tid{0};
   std::int32_t cpu{0};
@@ -83,13 +83,13 @@ struct EntityDescription {
   EntityKind kind{EntityKind::subscription};
   MaybePlace group;  // mutually exclusive callback group; none: it may always run
   Body body{Body::compute};
-  Place gate{0};             // if it is a gate, or listens for the modes of one
-  Place synchroniser{0};     // if it is an input of one
+  Place gate{0};             // of a gate, or of a listener for a gate's modes
+  Place synchroniser{0};     // of an input of a synchroniser
   Place input{0};            // which input of the synchroniser it is
   Nanoseconds period_ns{1};  // of a timer
   Nanoseconds due_ns{0};     // when a timer expires first
   Place execution{0};        // stream of CPU times of the callback before it publishes
-  MaybePlace afterwards;     // the same after it has published; none: it ends then
+  MaybePlace afterwards;     // stream of CPU times after it has published; none: it ends then
   Place first_publisher{0};  // it publishes with these publishers, in their order
   Place publisher_count{0};
   std::optional<Nanoseconds> lifespan_ns;  // a message that has waited for longer is dropped
@@ -111,21 +111,21 @@ struct PublisherDescription {
   std::size_t depth{1};                    // of an asynchronous one
   std::optional<Nanoseconds> lifespan_ns;  // of an asynchronous one
   bool ends_chain{false};
-  std::vector<std::int64_t> modes;  // that it announces in turn; empty: none
+  std::vector<std::int64_t> modes;  // its messages announce these in turn; empty: none
 };
 
 struct GateDescription {
   Gate gate;
   std::vector<std::int64_t> modes;  // the number of each of the gate's modes in the application
-  // Shifts of all slots against the gate's: the time from which each holds, and how far it is.
+  // Shifts of all slots: the time from which each shift is in force, and the shift.
   std::vector<std::pair<Nanoseconds, Nanoseconds>> moves;
-  Nanoseconds spin_ns{0};   // for how long it watches the clock before a release
+  Nanoseconds spin_ns{0};   // for how long it spins before a release
   Nanoseconds pause_ns{0};  // for how long it rests after a publication
 };
 
-// A synchroniser makes sets of messages, one of each input. A set is complete when its last message
-// comes. With a `trigger`, each message of that input completes a set, with the newest messages of
-// all other inputs.
+// A synchroniser combines messages to sets, each with a message of every input. A set is complete
+// when the last of its messages has come. With a `trigger`, each message of that input completes a
+// set with the newest messages of all other inputs.
 struct SynchroniserDescription {
   struct Input {
     bool on_chain{false};
@@ -135,7 +135,7 @@ struct SynchroniserDescription {
   MaybePlace trigger;
 };
 
-// A sequence of CPU times or delays: a constant, or numbers that are asked for in blocks.
+// A sequence of CPU times or delays: a constant, or numbers that the engine asks for in blocks.
 struct StreamDescription {
   std::optional<Nanoseconds> constant_ns;
 };
@@ -151,21 +151,21 @@ struct Description {
   std::vector<StreamDescription> streams;
   std::size_t groups{0};
   Nanoseconds cycle_ns{0};           // of the plan in force; 0: no plan is
-  Nanoseconds quantum_ns{forever};   // how long a turn takes; `forever`: equals take no turns
-  Nanoseconds context_switch_ns{0};  // CPU time that switching costs the thread switched to
+  Nanoseconds quantum_ns{forever};   // of threads of equal rank in turn; `forever`: no turns
+  Nanoseconds context_switch_ns{0};  // CPU time that a switch costs the thread that runs then
   Nanoseconds preemption_ns{0};      // CPU time that resuming costs a thread that was pre-empted
   std::int64_t interrupts_ppm{0};    // by how much interrupts make callbacks longer
   Nanoseconds last_timer_ns{0};      // timers expire until then
-  Nanoseconds stop_ns{0};
-  Nanoseconds record_from_ns{0};    // events and instances of the chain count from then on
-  bool events{true};                // whether events are logged
-  bool switches{false};             // whether context switches are logged
-  std::size_t instances{0};         // of how many instances of the chain latencies are kept
-  std::size_t log_rows{131'072};    // the engine pauses when the log has so many rows of a kind
-  std::size_t most_messages{4096};  // if more are under way, messages pile up without end
+  Nanoseconds stop_ns{0};            // the simulation ends then
+  Nanoseconds record_from_ns{0};     // events and instances of the chain count from then on
+  bool events{true};                 // whether events are logged
+  bool switches{false};              // whether context switches are logged
+  std::size_t instances{0};          // of so many instances of the chain latencies are recorded
+  std::size_t log_rows{131'072};     // when the log has so many rows of a kind, the engine pauses
+  std::size_t most_messages{4096};   // when so many are under way, the engine gives up
 };
 
-// Throws std::invalid_argument if a place is not in its list, or a number is not possible.
+// Throws std::invalid_argument if a place is not in its list, or a number is impossible.
 void check(const Description & description);
 
 }  // namespace chainshaper::simulation

@@ -9,12 +9,12 @@ Pause Engine::run(std::uint64_t most_instants) {
   pause_ = Pause::none;
   for (std::uint64_t instants = 0; instants < most_instants && pause_ == Pause::none; ++instants) {
     const Nanoseconds instant = next_instant();
-    if (instant > given_.stop_ns) return Pause::over;
+    if (instant > description_.stop_ns) return Pause::over;
     if (instant > now_) steps_ = 0;
     now_ = instant;
     count_step();
     while (agenda_.next_time() <= now_) happen(agenda_.take_next());
-    // A thread that goes on may cause something that happens now: one goes on at a time.
+    // A thread that goes on may plan something for this instant, so only one goes on at a time.
     if (let_one_thread_go_on()) continue;
     for (Core & core : cores_) {
       if (core.boundary <= now_) cross_boundary(core);
@@ -30,7 +30,7 @@ std::vector<Nanoseconds> Engine::latencies() const {
 }
 
 void Engine::count_step() {
-  constexpr std::uint64_t most = 1'000'000;  // as no application needs at an instant
+  constexpr std::uint64_t most = 1'000'000;  // more than any application needs at an instant
   if (++steps_ > most) pause_ = Pause::endless;
 }
 
@@ -52,7 +52,8 @@ Nanoseconds Engine::next_instant() const {
   return instant;
 }
 
-// Lets one running thread go on that has used what it needed for a step, or its quantum.
+// Lets a single running thread go on that has used the CPU time for its step, or its quantum.
+// Returns whether there is one.
 bool Engine::let_one_thread_go_on() {
   for (Core & core : cores_) {
     if (core.until > now_) continue;
@@ -62,7 +63,7 @@ bool Engine::let_one_thread_go_on() {
       advance(thread);
     } else if (core.quantum <= 0) {
       queue_up(thread);
-      core.quantum = given_.quantum_ns;
+      core.quantum = description_.quantum_ns;
       core.changed = true;
     }
     run_until_next_step(core);
@@ -71,7 +72,7 @@ bool Engine::let_one_thread_go_on() {
   return false;
 }
 
-// Notes when the running thread needs to be looked at again.
+// Sets when the running thread has to be looked at again.
 void Engine::run_until_next_step(Core & core) const {
   core.until = forever;
   if (core.running == nullptr || !core.running->runnable) return;
@@ -80,7 +81,7 @@ void Engine::run_until_next_step(Core & core) const {
   core.until = later(now_, takes_turns ? std::min(left, core.quantum) : left);
 }
 
-// Accounts for what the running thread has used since it was looked at last.
+// Counts the CPU time that the running thread has used since this was called last.
 void Engine::charge(Core & core) const {
   if (core.running == nullptr) return;
   const Nanoseconds used = now_ - core.since;
@@ -90,14 +91,14 @@ void Engine::charge(Core & core) const {
   core.since = now_;
 }
 
-// Opens and closes servers. The boundary after that may be in the next cycle.
+// Opens and closes servers; sets the next boundary, which may be in the next cycle.
 void Engine::cross_boundary(Core & core) const {
   const OpenServers & row = core.table[core.next];
   core.open_servers = row.servers;
   Nanoseconds elapsed = -row.offset_ns;
   if (++core.next == core.table.size()) {
     core.next = 0;
-    elapsed += given_.cycle_ns;
+    elapsed += description_.cycle_ns;
   }
   core.boundary = later(core.boundary, elapsed + core.table[core.next].offset_ns);
   core.changed = true;
@@ -117,7 +118,7 @@ bool goes_before(const Thread & thread, const Thread * best) {
 
 }  // namespace
 
-// Lets the best eligible thread run.
+// Lets the eligible thread of the smallest rank and sequence run.
 void Engine::reschedule(Core & core) {
   core.changed = false;
   charge(core);
@@ -132,18 +133,18 @@ void Engine::switch_to(Core & core, Thread * thread) {
   Thread * before = core.running;
   const bool was_runnable = before != nullptr && before->runnable;
   if (was_runnable) before->preempted = true;
-  if (given_.switches) {
+  if (description_.switches) {
     log(TracePoint::context_switch, now_, thread,
         {&core - cores_.data(), before == nullptr ? absent : before->place, was_runnable ? 1 : 0});
   }
   core.running = thread;
   if (thread == nullptr) return;
-  if (thread->preempted) thread->left = later(thread->left, given_.preemption_ns);
+  if (thread->preempted) thread->left = later(thread->left, description_.preemption_ns);
   thread->preempted = false;
-  if (thread != core.ran_last) thread->left = later(thread->left, given_.context_switch_ns);
+  if (thread != core.ran_last) thread->left = later(thread->left, description_.context_switch_ns);
   core.ran_last = thread;
   core.since = now_;
-  core.quantum = given_.quantum_ns;
+  core.quantum = description_.quantum_ns;
 }
 
 // Stops running a thread that has nothing to do.
@@ -152,7 +153,7 @@ void Engine::wait(Thread & thread) {
   thread.core->changed = true;
 }
 
-// Makes a thread runnable, last of its rank, if it waits with `step` as its next one.
+// Makes a thread runnable, behind all threads of its rank, if it waits and `step` is its next step.
 void Engine::wake(Thread & thread, Step step) {
   if (thread.runnable || thread.step != step) return;
   thread.runnable = true;
@@ -168,9 +169,9 @@ void Engine::sleep(Thread & thread, Nanoseconds until) {
 
 void Engine::log(TracePoint point, Nanoseconds time, const Thread * thread,
                  std::initializer_list<std::int64_t> fields) {
-  if (!given_.events || time < given_.record_from_ns) return;
+  if (!description_.events || time < description_.record_from_ns) return;
   const auto place = thread == nullptr ? static_cast<std::int32_t>(absent) : thread->place;
-  if (log_.add(point, time, place, fields) >= given_.log_rows && pause_ == Pause::none)
+  if (log_.add(point, time, place, fields) >= description_.log_rows && pause_ == Pause::none)
     pause_ = Pause::log_full;
 }
 

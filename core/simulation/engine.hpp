@@ -50,15 +50,15 @@ namespace chainshaper::simulation {
 enum class Pause {
   none,           // the number of instants that was asked for has passed
   log_full,       // the caller has to take the log
-  messages_full,  // messages pile up without end, so the simulation cannot go on
-  endless,        // callbacks cause each other without time passing, so it cannot go on
-  over,           // the end has come
+  messages_full,  // too many messages are under way, so the simulation cannot go on
+  endless,        // callbacks cause each other in no time, so the simulation cannot go on
+  over,           // the end of the simulation was reached
 };
 
 class Engine {
 public:
-  // Throws std::invalid_argument for a contradictory description. `source` is asked for numbers
-  // while the engine runs.
+  // Throws std::invalid_argument for a contradictory description. The engine asks `source` for
+  // numbers while it runs.
   Engine(Description description, Source source);
 
   Engine(const Engine &) = delete;
@@ -68,12 +68,12 @@ public:
   Pause run(std::uint64_t most_instants);
 
   Nanoseconds now() const { return now_; }
-  const Description & description() const { return given_; }
+  const Description & description() const { return description_; }
 
   // Returns and empties the log.
   std::vector<EntryColumns> take_log() { return log_.take_all(); }
 
-  // Returns the latency of each started instance of the chain; `absent`: it did not complete.
+  // Returns the latency of each recorded instance of the chain; `absent`: it did not complete.
   std::vector<Nanoseconds> latencies() const;
 
 private:
@@ -107,8 +107,8 @@ private:
   bool take_message(Thread & thread, Entity & entity);
   void wake_owner(const Executor & executor);
 
-  // callbacks.cpp: what callbacks do. These functions set the CPU time that their thread needs next
-  // and the step that follows, or let the thread wait. They return whether the callback goes on.
+  // callbacks.cpp: what callbacks do. These functions set the thread's next step and the CPU time
+  // before it, or let the thread wait. They return whether the callback goes on.
   bool begin_body(Thread & thread);
   bool go_on_publishing(Thread & thread);
   bool end(Thread & thread);
@@ -133,11 +133,11 @@ private:
   void note_latency(const Message & message);
   void deliver(Message & message);
   void arrive(Message & message);
-  void work_for_executor(Thread & thread);
+  void send_or_receive(Thread & thread);
   void send_next(Thread & thread);
   void put_newest(MessageQueue & queue, std::size_t depth, Message & message);
   void drop_expired(Entity & entity);
-  void mark_event(Entity & entity);
+  void queue_event(Entity & entity);
   Message & new_message();
   void count_in_use();
   void count_step();
@@ -151,7 +151,7 @@ private:
   void set_up_entities();
   void set_up_publishers();
 
-  Description given_;
+  Description description_;
   Source source_;
   std::vector<Stream> streams_;
   std::vector<Core> cores_;
@@ -167,10 +167,10 @@ private:
   std::uint64_t next_sequence_{0};
   Agenda agenda_;
   MessagePool messages_;
-  std::size_t marks_{0};  // entries in Executor::events and Thread::to_send of all
+  std::size_t queued_entries_{0};  // in Executor::events and Thread::to_send of all
   EventLog log_;
   Pause pause_{Pause::none};
-  std::uint64_t steps_{0};  // of threads and of the engine, at the present instant
+  std::uint64_t steps_{0};  // of threads and of the engine at this instant
   std::vector<Nanoseconds> latencies_;
   std::size_t started_{0};  // recorded instances of the chain
 };

@@ -45,7 +45,8 @@ void move_to_larger(Column<Number> & column, std::size_t count, std::size_t room
 }  // namespace
 
 void EventLog::grow(EntryColumns & columns) const {
-  constexpr std::size_t spare = 1024;  // what may come until the caller takes the log
+  constexpr std::size_t spare =
+      1024;  // entries that may still come before the caller takes the log
   columns.room = columns.room == 0 ? rows_ + spare : 2 * columns.room;
   move_to_larger(columns.times, columns.count, columns.room);
   move_to_larger(columns.threads, columns.count, columns.room);

@@ -32,7 +32,7 @@ enum class TracePoint : std::size_t {
 
 struct EntryNames {
   const char * entry;
-  std::vector<const char *> fields;  // behind time and thread
+  std::vector<const char *> fields;  // that follow time and thread
 };
 
 // The names of all entries, in the order of `TracePoint`.
@@ -42,10 +42,10 @@ const std::vector<EntryNames> & log_layout();
 template <typename Number>
 using Column = std::unique_ptr<Number[]>;
 
-// Entries of one kind, column by column; each has room for so many.
+// The entries of a kind, column by column.
 struct EntryColumns {
-  std::size_t count{0};
-  std::size_t room{0};
+  std::size_t count{0};  // entries
+  std::size_t room{0};   // entries for which the columns have room
   Column<Nanoseconds> times;
   Column<std::int32_t> threads;  // places; `absent`: the idle thread
   std::vector<Column<std::int64_t>> fields;
@@ -69,7 +69,7 @@ public:
     return columns.count;
   }
 
-  // All entries, in the order of `TracePoint`; the log is empty then.
+  // Returns all entries, in the order of `TracePoint`, and empties the log.
   std::vector<EntryColumns> take_all();
 
 private:

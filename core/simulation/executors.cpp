@@ -1,4 +1,4 @@
-// What a thread does next: executors, and what a message or an expiry has them do.
+// What the threads of an executor do next, and what an expiry or a message makes them do.
 
 #include <algorithm>
 
@@ -21,7 +21,7 @@ void Engine::advance(Thread & thread) {
       case Step::sent:
       case Step::receive:
       case Step::received:
-        work_for_executor(thread);
+        send_or_receive(thread);
         break;
       case Step::take:
       case Step::publish:
@@ -47,7 +47,7 @@ bool Engine::go_on_with_callback(Thread & thread) {
 // Handles a timer's expiry: the executor sees it in its next snapshot, or gets an event.
 void Engine::expire(Entity & timer) {
   if (timer.executor->kind == ExecutorKind::events) {
-    mark_event(timer);
+    queue_event(timer);
     call_timer(timer);
   }
   if (timer.may_run()) wake_owner(*timer.executor);
@@ -55,16 +55,16 @@ void Engine::expire(Entity & timer) {
 
 // Moves on to the first expiry that is not over yet, as `rcl_timer_call` does.
 void Engine::call_timer(Entity & timer) {
-  const Nanoseconds period = timer.given->period_ns;
+  const Nanoseconds period = timer.description->period_ns;
   const Nanoseconds over = now_ - timer.due;
   const Nanoseconds missed = over <= 0 ? 0 : (over - 1) / period;
   timer.due = later(timer.due + missed * period, period);
-  if (timer.due <= given_.last_timer_ns) agenda_.plan(timer.due, Expiry{&timer});
+  if (timer.due <= description_.last_timer_ns) agenda_.plan(timer.due, Expiry{&timer});
 }
 
 bool Engine::is_ready(Entity & entity) {
-  if (entity.given->kind == EntityKind::timer)
-    return entity.due <= std::min(now_, given_.last_timer_ns);
+  if (entity.description->kind == EntityKind::timer)
+    return entity.due <= std::min(now_, description_.last_timer_ns);
   drop_expired(entity);
   return entity.history.size() > 0;
 }
@@ -87,7 +87,7 @@ void Engine::collect(Thread & thread) {
 
 namespace {
 
-// Takes what comes first of the snapshot and may run out of it; none if nothing does.
+// Takes the first entity that may run out of the snapshot; none: there is no such entity.
 Entity * first_ready(const Executor & executor) {
   Entity * chosen = nullptr;
   for (Entity & entity : executor.entities) {
@@ -104,7 +104,7 @@ Entity * first_ready(const Executor & executor) {
 
 }  // namespace
 
-// The next of the snapshot is executed; if there is none left, a new one is taken.
+// Begins to execute the next entity of the snapshot; if there is none, a new snapshot comes next.
 void Engine::choose(Thread & thread) {
   Executor & executor = *thread.executor;
   if (executor.kind == ExecutorKind::multi_threaded && !takes_turn(thread)) return;
@@ -114,7 +114,7 @@ void Engine::choose(Thread & thread) {
   } else if (!executor.events.empty()) {
     chosen = executor.events.front();
     executor.events.pop_front();
-    --marks_;
+    --queued_entries_;
   }
   if (chosen == nullptr)
     refill(thread);
@@ -124,19 +124,20 @@ void Engine::choose(Thread & thread) {
 
 void Engine::begin(Thread & thread, Entity & chosen) {
   Executor & executor = *thread.executor;
-  log(TracePoint::execute, now_, &thread, {chosen.given->handle});
+  log(TracePoint::execute, now_, &thread, {chosen.description->handle});
   thread.entity = &chosen;
   thread.step = Step::take;
-  if (chosen.given->kind != EntityKind::timer)
+  if (chosen.description->kind != EntityKind::timer)
     thread.left = draw(*thread.take);
-  else if (executor.kind != ExecutorKind::events)  // there, it was called when it expired
+  else if (executor.kind != ExecutorKind::events)  // those call a timer when it expires
     call_timer(chosen);
   if (executor.kind != ExecutorKind::multi_threaded) return;
   if (chosen.group_is_busy != nullptr) *chosen.group_is_busy = true;
   give_turn(executor);
 }
 
-// Whether no other thread of the executor waits or takes what is next; else it queues up.
+// Makes the thread the one that waits or chooses, and returns true; or, if another thread is that,
+// lets it queue up.
 bool Engine::takes_turn(Thread & thread) {
   Executor & executor = *thread.executor;
   if (executor.owner == nullptr || executor.owner == &thread) {
@@ -149,7 +150,7 @@ bool Engine::takes_turn(Thread & thread) {
   return false;
 }
 
-// Wakes the thread that has queued up for longest; another may be quicker.
+// Wakes the thread that has queued up for longest; yet another one may take the turn before it.
 void Engine::give_turn(Executor & executor) {
   executor.owner = nullptr;
   Thread * longest = nullptr;
@@ -163,27 +164,27 @@ void Engine::give_turn(Executor & executor) {
 void Engine::refill(Thread & thread) {
   thread.step = Step::collect;
   if (thread.executor->kind == ExecutorKind::events) return;
-  Nanoseconds due = given_.stop_ns;
+  Nanoseconds due = description_.stop_ns;
   for (const Entity & entity : thread.executor->entities)
-    if (entity.given->kind == EntityKind::timer && entity.due <= given_.last_timer_ns)
+    if (entity.description->kind == EntityKind::timer && entity.due <= description_.last_timer_ns)
       due = std::min(due, entity.due);
   log(TracePoint::wait, now_, &thread, {std::max<Nanoseconds>(0, due - now_)});
 }
 
-// Takes the message of the chosen entity and starts its callback; false if it is over.
+// Takes the message of the chosen entity and begins its callback; returns whether that goes on.
 bool Engine::take(Thread & thread) {
   Entity & entity = *thread.entity;
-  if (entity.given->kind == EntityKind::timer) {
+  if (entity.description->kind == EntityKind::timer) {
     thread.carried.chain_start.reset();
     thread.carried.origin = now_;
   } else if (!take_message(thread, entity)) {
     return false;
   }
-  if (entity.given->starts_chain && now_ >= given_.record_from_ns) {
+  if (entity.description->starts_chain && now_ >= description_.record_from_ns) {
     thread.carried.chain_start = now_;
     thread.carried.instance = started_++;
   }
-  log(TracePoint::callback_start, now_, &thread, {entity.given->callback, thread.used, 0});
+  log(TracePoint::callback_start, now_, &thread, {entity.description->callback, thread.used, 0});
   return begin_body(thread);
 }
 
@@ -191,19 +192,19 @@ bool Engine::take_message(Thread & thread, Entity & entity) {
   drop_expired(entity);
   if (entity.history.size() == 0) {
     thread.carried.chain_start.reset();
-    log(TracePoint::take, now_, &thread, {entity.given->rmw_handle, 0, 0, 0});
+    log(TracePoint::take, now_, &thread, {entity.description->rmw_handle, 0, 0, 0});
     return false;
   }
   Message & message = entity.history.take_oldest();
   thread.carried = message.carried;
-  if (!entity.given->on_chain) thread.carried.chain_start.reset();
+  if (!entity.description->on_chain) thread.carried.chain_start.reset();
   log(TracePoint::take, now_, &thread,
-      {entity.given->rmw_handle, message.address, message.carried.source, 1});
+      {entity.description->rmw_handle, message.address, message.carried.source, 1});
   messages_.give_back(message);
   return true;
 }
 
-// Something may be ready for an executor: wakes the thread that waits for it.
+// Wakes the thread that waits for work of an executor, as something may be ready.
 void Engine::wake_owner(const Executor & executor) {
   if (executor.owner != nullptr) wake(*executor.owner, Step::collect);
 }

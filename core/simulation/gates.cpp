@@ -1,4 +1,4 @@
-// Callbacks that are gates: core/gate decides, and here its thread waits, watches and publishes.
+// Callbacks that are gates: core/gate decides; here the gate's thread sleeps, spins and publishes.
 
 #include "simulation/engine.hpp"
 
@@ -14,9 +14,9 @@ std::int64_t number_of(const std::optional<Number> & value) {
 
 bool Engine::enter_gate(Thread & thread) {
   GateAtWork & gate = *thread.entity->gate;
-  // A gate at rest knows of a message when it has taken it.
-  const bool rested = thread.carried.arrival >= gate.decisions.free_ns;
-  gate.arrival = rested ? now_ : thread.carried.arrival;
+  // A message that comes to an idle gate arrives when the gate has taken it.
+  const bool was_idle = thread.carried.arrival >= gate.decisions.free_ns;
+  gate.arrival = was_idle ? now_ : thread.carried.arrival;
   const Nanoseconds phase = gate.decisions.see_phase(gate.arrival, thread.carried.origin);
   gate.release = gate.decisions.decide({gate.arrival, thread.carried.origin, phase});
   thread.began = now_;
@@ -27,7 +27,7 @@ bool Engine::enter_gate(Thread & thread) {
   return true;
 }
 
-// A thread of a gate goes on: awake, watching the clock, having published or paused.
+// Does what follows in a gate when its thread has woken, spun, published or paused.
 bool Engine::pass_gate(Thread & thread) {
   GateAtWork & gate = *thread.entity->gate;
   if (thread.step == Step::gate_wake) {
@@ -37,10 +37,10 @@ bool Engine::pass_gate(Thread & thread) {
       if (!gate.release.at_ns) return leave_gate(thread);
     }
     if (now_ >= *gate.release.at_ns) return publish_from_gate(thread);
-    thread.left = *gate.release.at_ns - now_;  // watching the clock
+    thread.left = *gate.release.at_ns - now_;  // it spins until then
     return true;
   }
-  // Another message that waits already must not become late by the pause.
+  // The pause must not delay a message that waits already.
   const bool published = thread.step == Step::gate_published;
   if (published && gate.pause > 0 && thread.entity->history.size() == 0) {
     thread.step = Step::gate_paused;
@@ -66,11 +66,11 @@ bool Engine::publish_from_gate(Thread & thread) {
   return true;
 }
 
-// Looks at the messages that came meanwhile: a newer one may replace the message at the gate, or
-// there may be no room for more.
+// Drops the message at the gate if a newer one that came meanwhile replaces it, or if there is no
+// room for another message.
 void Engine::look_at_waiting(const Entity & entity) {
   GateAtWork & gate = *entity.gate;
-  if (entity.history.size() == entity.given->depth) {
+  if (entity.history.size() == entity.description->depth) {
     gate.release.drop(Dropped::overflowed);
     return;
   }
@@ -107,7 +107,7 @@ void Engine::log_release(const Entity & entity, Nanoseconds time, const Thread &
                          Nanoseconds source, Nanoseconds arrival, const Release & release) {
   const std::int64_t mode = release.mode ? entity.gate->modes[*release.mode] : absent;
   log(TracePoint::release, time, &thread,
-      {entity.given->callback, source, arrival, release.origin_ns, number_of(release.at_ns),
+      {entity.description->callback, source, arrival, release.origin_ns, number_of(release.at_ns),
        number_of(release.slot), release.cycles_waited, static_cast<std::int64_t>(release.anchor),
        number_of(release.overrun), mode, number_of(release.dropped), release.moved_ns});
 }

@@ -14,7 +14,7 @@ namespace chainshaper::simulation {
 struct Entity;
 struct Publisher;
 
-// What a message carries from callback to callback.
+// What a message carries, and the callback that takes it passes on in its own messages.
 struct Carried {
   Nanoseconds source{0};                   // its source timestamp
   Nanoseconds origin{0};                   // the stamp of its header
@@ -25,15 +25,15 @@ struct Carried {
 };
 
 struct Message {
-  Message * next{nullptr};  // the next one in its queue, or among the unused ones
+  Message * next{nullptr};  // in its queue, or among the unused messages
   Entity * entity{nullptr};
   Publisher * publisher{nullptr};
   std::int64_t address{0};
   Carried carried;
 };
 
-// Owns all messages. Messages that are given back are used again, so a long run allocates only as
-// many as were ever under way at once.
+// Owns all messages. Messages that are given back are used again, so even a long run allocates no
+// more than were ever under way at the same time.
 class MessagePool {
 public:
   Message & take() {

@@ -1,7 +1,7 @@
 // What changes while an application is simulated: cores, threads, executors, callbacks, topics.
 //
-// Each points to its part of the description, and to the others that it works with. None is moved
-// in memory.
+// They point to their parts of the description and to each other, so none of them is ever moved in
+// memory.
 
 #pragma once
 
@@ -60,7 +60,7 @@ enum class Step {
 };
 
 struct Thread {
-  std::int64_t rank;     // the thread with the smallest runs
+  std::int64_t rank;     // the thread with the smallest rank runs
   std::uint64_t server;  // the bit of its server in Core::open_servers; 0: it runs at any time
   std::int32_t place;    // in the list of threads
   Core * core;
@@ -76,13 +76,13 @@ struct Thread {
   bool preempted{false};
   Nanoseconds left{0};               // CPU time to the next step
   Nanoseconds used{0};               // CPU time so far
-  std::uint64_t sequence{0};         // of the threads of a rank, the one with the smallest runs
+  std::uint64_t sequence{0};         // of threads of equal rank, that with the smallest runs
   Entity * entity{nullptr};          // the entity whose callback it runs
   std::size_t publication{0};        // how many of the entity's publishers have published
   Publisher * sending{nullptr};      // of a publisher thread
   std::deque<Publisher *> to_send;   // of a publisher thread
   MessageQueue to_receive;           // of a thread of DDS
-  Carried carried;                   // what its present message carries
+  Carried carried;                   // what the message at which it works carries
   std::optional<Nanoseconds> began;  // when it began to send, or its gate woke up
 };
 
@@ -92,11 +92,12 @@ struct Executor {
   std::vector<Thread *> threads;
   Thread * publisher_thread{nullptr};  // none: nothing is published asynchronously
   Thread * dds_thread{nullptr};        // none: receiving takes no CPU time
-  Thread * owner{nullptr};             // the thread that waits or chooses; none: all run callbacks
-  std::deque<Entity *> events;         // of an events executor: the entities to run, in order
+  // The thread that waits for work or chooses a callback; none: all its threads run callbacks.
+  Thread * owner{nullptr};
+  std::deque<Entity *> events;  // of an events executor: the entities to run, in order
 };
 
-// A gate in a callback: its messages wait in the history of its reader.
+// A gate in a callback. Messages wait for it in the history of its reader.
 struct GateAtWork {
   explicit GateAtWork(const GateDescription & described)
       : decisions(described.gate),
@@ -125,9 +126,9 @@ struct Synchroniser {
 };
 
 struct Entity {
-  const EntityDescription * given;
+  const EntityDescription * description;
   Executor * executor;
-  bool * group_is_busy;  // whether its callback group is; none: it may always run
+  bool * group_is_busy;  // of its callback group; none: it may always run
   Stream * execution;
   Stream * afterwards;
   std::span<Publisher> publishers;
@@ -143,12 +144,12 @@ struct Entity {
 
 struct ReaderOf {
   Entity * entity;
-  Stream * delivery;            // none: it is the sending thread's
+  Stream * delivery;            // none: that of the sending thread
   Nanoseconds last_arrival{0};  // DDS delivers the messages of a publisher in order
 };
 
 struct Publisher {
-  const PublisherDescription * given;
+  const PublisherDescription * description;
   std::int64_t place;  // in the list of publishers
   std::vector<ReaderOf> readers;
   MessageQueue history;  // messages that wait for the publisher thread

@@ -10,29 +10,30 @@ namespace {
 // Addresses of messages repeat, as they do in a real process.
 constexpr std::uint64_t addresses = 64;
 constexpr std::int64_t first_address = 0x7F00'0000'0000;
-constexpr std::int64_t apart = 0x480;
+constexpr std::int64_t distance = 0x480;
 
 std::int64_t next_address(const Publisher & publisher) {
   const auto number = static_cast<std::int64_t>(publisher.published % addresses);
-  return first_address + (publisher.place * std::int64_t{addresses} + number) * apart;
+  return first_address + (publisher.place * std::int64_t{addresses} + number) * distance;
 }
 
 }  // namespace
 
 // Publishes a message with what the thread carries.
 void Engine::publish(Thread & thread, Publisher & publisher) {
-  const PublisherDescription & given = *publisher.given;
+  const PublisherDescription & description = *publisher.description;
   Message & message = new_message();
   message.publisher = &publisher;
   message.address = next_address(publisher);
   message.carried = thread.carried;
   message.carried.source = now_;
   message.carried.mode.reset();
-  if (!given.modes.empty())
-    message.carried.mode = given.modes[publisher.published % given.modes.size()];
+  if (!description.modes.empty())
+    message.carried.mode = description.modes[publisher.published % description.modes.size()];
   ++publisher.published;
-  log(TracePoint::publish, now_, &thread, {given.handle, given.rmw_handle, message.address, now_});
-  if (given.asynchronous)
+  log(TracePoint::publish, now_, &thread,
+      {description.handle, description.rmw_handle, message.address, now_});
+  if (description.asynchronous)
     hand_over(*thread.executor->publisher_thread, publisher, message);
   else
     send(thread, message);
@@ -40,20 +41,20 @@ void Engine::publish(Thread & thread, Publisher & publisher) {
 
 // Queues an asynchronous publisher's message for the publisher thread.
 void Engine::hand_over(Thread & sender, Publisher & publisher, Message & message) {
-  if (publisher.history.size() < publisher.given->depth) {
+  if (publisher.history.size() < publisher.description->depth) {
     sender.to_send.push_back(&publisher);
-    ++marks_;
+    ++queued_entries_;
     count_in_use();
-  } else {  // the oldest is lost; `to_send` has an entry for it, which the newer ones use
+  } else {  // the oldest message is lost; its entry in `to_send` serves for the new one
     log(TracePoint::send, now_, &sender,
-        {publisher.given->rmw_handle, publisher.history.oldest().carried.source,
+        {publisher.description->rmw_handle, publisher.history.oldest().carried.source,
          static_cast<std::int64_t>(SendOutcome::overwritten), 0});
   }
-  put_newest(publisher.history, publisher.given->depth, message);
+  put_newest(publisher.history, publisher.description->depth, message);
   wake(sender, Step::send);
 }
 
-// Sends a message from a thread, now; each reader gets a copy.
+// Sends a message now; each reader gets a copy.
 void Engine::send(Thread & thread, Message & message) {
   note_latency(message);
   for (ReaderOf & reader : message.publisher->readers) {
@@ -73,7 +74,7 @@ void Engine::send(Thread & thread, Message & message) {
 
 void Engine::note_latency(const Message & message) {
   const Carried & carried = message.carried;
-  if (!message.publisher->given->ends_chain || !carried.chain_start) return;
+  if (!message.publisher->description->ends_chain || !carried.chain_start) return;
   if (carried.instance >= latencies_.size()) return;
   Nanoseconds & latency = latencies_[carried.instance];
   if (latency == absent) latency = now_ - *carried.chain_start;
@@ -93,22 +94,22 @@ void Engine::deliver(Message & message) {
 // Puts a message into its reader's history, and wakes the executor if it waits for work.
 void Engine::arrive(Message & message) {
   Entity & entity = *message.entity;
-  const bool overwrites = entity.history.size() == entity.given->depth;
+  const bool overwrites = entity.history.size() == entity.description->depth;
   message.carried.arrival = now_;
-  if (overwrites && entity.given->body == Body::gate) overflow(entity);
-  put_newest(entity.history, entity.given->depth, message);
-  // The event of the message that was overwritten is still in the queue, for this one to use.
-  if (entity.executor->kind == ExecutorKind::events && !overwrites) mark_event(entity);
+  if (overwrites && entity.description->body == Body::gate) overflow(entity);
+  put_newest(entity.history, entity.description->depth, message);
+  // The event of an overwritten message is still in the queue, and serves for this message.
+  if (entity.executor->kind == ExecutorKind::events && !overwrites) queue_event(entity);
   if (entity.may_run()) wake_owner(*entity.executor);
 }
 
 // Does the next step of a publisher thread or a DDS thread.
-void Engine::work_for_executor(Thread & thread) {
+void Engine::send_or_receive(Thread & thread) {
   switch (thread.step) {
     case Step::sent: {
       const Nanoseconds began = thread.began.value_or(now_);
       log(TracePoint::send, began, &thread,
-          {thread.sending->given->rmw_handle, thread.carried.source,
+          {thread.sending->description->rmw_handle, thread.carried.source,
            static_cast<std::int64_t>(SendOutcome::sent), now_ - began});
       thread.step = Step::send;
       break;
@@ -131,13 +132,14 @@ void Engine::work_for_executor(Thread & thread) {
 void Engine::send_next(Thread & thread) {
   Publisher & publisher = *thread.to_send.front();
   thread.to_send.pop_front();
-  --marks_;
+  --queued_entries_;
   Message & message = publisher.history.take_oldest();
   const Nanoseconds source = message.carried.source;
-  const auto & lifespan = publisher.given->lifespan_ns;
+  const auto & lifespan = publisher.description->lifespan_ns;
   if (lifespan && now_ - source > *lifespan) {
     log(TracePoint::send, now_, &thread,
-        {publisher.given->rmw_handle, source, static_cast<std::int64_t>(SendOutcome::expired), 0});
+        {publisher.description->rmw_handle, source, static_cast<std::int64_t>(SendOutcome::expired),
+         0});
     messages_.give_back(message);
     return;
   }
@@ -157,16 +159,16 @@ void Engine::put_newest(MessageQueue & queue, std::size_t depth, Message & messa
 
 // Forgets messages that have waited in a history for longer than their lifespan.
 void Engine::drop_expired(Entity & entity) {
-  const auto & lifespan = entity.given->lifespan_ns;
+  const auto & lifespan = entity.description->lifespan_ns;
   if (!lifespan) return;
   while (entity.history.size() > 0 && now_ - entity.history.oldest().carried.arrival > *lifespan)
     messages_.give_back(entity.history.take_oldest());
 }
 
 // Appends an entity to the queue of its events executor.
-void Engine::mark_event(Entity & entity) {
+void Engine::queue_event(Entity & entity) {
   entity.executor->events.push_back(&entity);
-  ++marks_;
+  ++queued_entries_;
   count_in_use();
 }
 
@@ -177,7 +179,8 @@ Message & Engine::new_message() {
 }
 
 void Engine::count_in_use() {
-  if (messages_.in_use() + marks_ >= given_.most_messages) pause_ = Pause::messages_full;
+  if (messages_.in_use() + queued_entries_ >= description_.most_messages)
+    pause_ = Pause::messages_full;
 }
 
 }  // namespace chainshaper::simulation

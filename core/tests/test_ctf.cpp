@@ -1,7 +1,11 @@
 // The trace decoder, over packets written by hand.
 
+#include <algorithm>
 #include <cstring>
+#include <numeric>
+#include <random>
 #include <string>
+#include <vector>
 
 #include "ctf/events.hpp"
 #include "ctf/sorting.hpp"
@@ -191,6 +195,41 @@ void rows_are_sorted_by_time_and_stay_in_order() {
   EXPECT((values == std::vector<std::uint8_t>{6, 0, 3, 1, 2, 4, 5}));
 }
 
+// Rows of a time that is not theirs, or that are not in their order, would not be where a stable
+// sort puts them.
+void expect_sorted(std::vector<std::int64_t> times_ns) {
+  std::vector<std::uint32_t> rows(times_ns.size());
+  std::iota(rows.begin(), rows.end(), 0U);
+  auto expected = rows;
+  std::stable_sort(expected.begin(), expected.end(),
+                   [&](auto left, auto right) { return times_ns[left] < times_ns[right]; });
+  sort_by_time({times_ns, {}, {{reinterpret_cast<std::uint8_t *>(rows.data()), 4, rows.size()}}});
+  EXPECT(rows == expected);
+  EXPECT(std::is_sorted(times_ns.begin(), times_ns.end()));
+}
+
+void many_rows_are_sorted_in_blocks() {
+  std::mt19937_64 chance(1);
+  const auto below = [&](std::int64_t limit) {
+    return static_cast<std::int64_t>(chance() % static_cast<std::uint64_t>(limit));
+  };
+  for (const std::int64_t runs : {2, 3, 8, 1000}) {
+    std::vector<std::int64_t> times_ns;
+    for (std::int64_t run = 0; run < runs; ++run) {
+      std::int64_t now = below(1000) - 500;
+      for (auto rows = below(100'000 / runs); rows >= 0; --rows)
+        times_ns.push_back(now += below(3));  // many are equal
+    }
+    expect_sorted(times_ns);
+  }
+  std::vector<std::int64_t> descending(50'000);
+  std::iota(descending.rbegin(), descending.rend(), 0);
+  expect_sorted(descending);
+  std::vector<std::int64_t> equal(50'000);
+  equal.front() = 1;
+  expect_sorted(equal);
+}
+
 void what_cannot_be_is_refused() {
   EXPECT_REFUSED(integer(65));
   EXPECT_REFUSED(integer(8, 3));
@@ -213,5 +252,6 @@ int main() {
   variants_take_the_option_of_their_tag();
   packets_behind_damage_are_found();
   rows_are_sorted_by_time_and_stay_in_order();
+  many_rows_are_sorted_in_blocks();
   what_cannot_be_is_refused();
 }

@@ -94,27 +94,27 @@ class CtfType:
         maps_clock: bool,
         labels: Sequence[tuple[str, int, int]],
     ) -> CtfType:
-        """An integer or an enumeration.
+        """Make the type of an integer, or of an enumeration.
 
-        ``labels`` are its labels with the lowest and the highest value, counted from the least
-        number of 64 bits with its sign. Raises ValueError for sizes that cannot be.
+        ``labels``: each label, and the lowest and highest value that it stands for, as distances
+        from the least integer of 64 bits, signed or not. Raises ValueError: impossible sizes.
         """
 
     @staticmethod
     def string() -> CtfType:
-        """Bytes up to and with the first NUL."""
+        """Make the type of a text: bytes up to and including the first NUL."""
 
     @staticmethod
     def array(*, element: CtfType, length: int | str, is_text: bool) -> CtfType:
-        """An array, or a sequence where the length is the path of a field before it."""
+        """Make the type of an array; of a sequence, if ``length`` is the path of a field."""
 
     @staticmethod
     def structure(*, fields: Sequence[tuple[str, CtfType]], align: int) -> CtfType:
-        """Fields that follow each other."""
+        """Make the type of fields that follow each other."""
 
     @staticmethod
     def variant(*, tag: str | None, options: Sequence[tuple[str, CtfType]]) -> CtfType:
-        """What an enumeration before it, whose path is the ``tag``, chooses."""
+        """Make the type of a variant: the enumeration at the path ``tag`` chooses an option."""
 
 class CtfEventClass:
     """What an event class declares; ``context`` and ``fields`` are structures."""
@@ -122,7 +122,7 @@ class CtfEventClass:
     def __init__(self, *, id: int, context: CtfType | None, fields: CtfType | None) -> None: ...
 
 class CtfStreamClass:
-    """What a stream class declares, all scopes being structures."""
+    """What a stream class declares; contexts and header are structures."""
 
     def __init__(
         self,
@@ -153,20 +153,22 @@ class CtfTraceClass:
         streams: Sequence[CtfStreamClass],
     ) -> None: ...
 
-# How their packets lie
+# Where the bits of packets are
 
 class CtfScope(Enum):
-    """Where behind an event's header a field stands."""
+    """The scope that a field of an event is in."""
 
     STREAM_EVENT_CONTEXT = ...
     EVENT_CONTEXT = ...
     EVENT_FIELDS = ...
 
 class CtfWantedEvent:
-    """An event class, counted over all traces, that is asked for.
+    """An event class that is wanted.
 
-    ``columns`` are the scopes and numbers of its fields that get one, in order. Tables are counted
-    from 0 in order of their first event; events of one table have the same types of columns.
+    * ``event``: its number, counted over all traces
+    * ``table``: that its events go to; tables are numbered from 0 in order of their first event,
+      and all events of a table have columns of the same types
+    * ``columns``: scope and number of each field that gets a column, in order
     """
 
     def __init__(
@@ -174,9 +176,9 @@ class CtfWantedEvent:
     ) -> None: ...
 
 class CtfLayout:
-    """How the bits of some traces' packets lie.
+    """Where the bits of some traces' packets are.
 
-    Raises ValueError, whose ``args`` are the reason and which of the traces it is.
+    Raises ValueError, whose ``args`` are the reason, and the number of the trace.
     """
 
     def __init__(
@@ -184,7 +186,7 @@ class CtfLayout:
     ) -> None: ...
     @property
     def traces(self) -> list[tuple[int, int]]:
-        """The stream classes of each trace, counted over all: the first and the one behind."""
+        """The stream classes of each trace, counted over all: the first, and the end."""
 
 # Finding packets
 
@@ -200,7 +202,10 @@ class CtfDamage(Enum):
     COSTLY = ...
 
 class CtfDamagedPlace:
-    """Damage at an ``offset`` (bytes) of a file; the packet ``following`` it, or -1 for none."""
+    """Damage at an ``offset`` (bytes) of a file.
+
+    ``following`` is the offset of the next packet; -1: the rest of the file is not read.
+    """
 
     @property
     def damage(self) -> CtfDamage: ...
@@ -222,8 +227,8 @@ class CtfPackets:
 def find_packets(layout: CtfLayout, trace: int, file: Buffer, *, beginning: bytes) -> CtfPackets:
     """Find the packets of a stream file of a trace.
 
-    Behind damage the file is read on where the bytes come that each packet has at its
-    ``beginning``; these may be none.
+    After damage it goes on at the next place with the bytes of ``beginning``, with which each
+    packet begins; if there are no such bytes, it ends there.
     """
 
 # Reading events
@@ -253,10 +258,14 @@ class CtfBadEvent:
     def failure(self) -> CtfFailure: ...
 
 class CtfFileChangedError(Exception):
-    """A file has not the events that were counted."""
+    """A file no longer has the events that were counted."""
 
 class CtfChunk:
-    """Packets [``first``, ``end``) of a file; rows of each table before them and behind them."""
+    """Packets [``first``, ``end``) of a file.
+
+    ``rows_before`` and ``rows_after``: for each table, how many rows the events of the file up to
+    the first of these packets have, and up to the last one.
+    """
 
     @property
     def first(self) -> int: ...
@@ -268,9 +277,10 @@ class CtfChunk:
     def rows_after(self) -> NDArray[np.int64]: ...
 
 class CtfTable:
-    """The arrays of one length that events of a table are written to; they live as long.
+    """The arrays, all of the same length, that events of a table are written to.
 
-    ``columns`` are integers of the width of their field's, or uint32, the codes of texts.
+    ``columns`` are integers as wide as the fields' integers, or uint32, the codes of texts. The
+    arrays stay alive as long as this object.
     """
 
     def __init__(
@@ -304,15 +314,15 @@ class CtfEventReader:
         latest: NDArray[np.int64],
     ) -> None: ...
     def count(self, end: int) -> CtfChunk:
-        """Count the events of the packets before ``end`` that were not counted yet."""
+        """Count the events of the packets up to ``end`` that were not counted yet."""
 
     def write(
         self, chunk: CtfChunk, tables: Sequence[CtfTable], first_rows: NDArray[np.int64]
     ) -> list[bytes]:
         """Write a chunk's events to tables, whose rows of this file begin at ``first_rows``.
 
-        Returns the texts by their code. Threads may write different chunks at once. Raises
-        CtfFileChangedError, and ValueError for tables that are not those of the layout.
+        Returns the texts in the order of their codes. Threads may write different chunks at once.
+        Raises CtfFileChangedError, and ValueError for tables that are not those of the layout.
         """
 
     @property
@@ -326,8 +336,8 @@ class CtfEventReader:
     @property
     def bad_events(self) -> list[CtfBadEvent]: ...
 
-def recode(codes: NDArray[np.uint32], others: NDArray[np.uint32]) -> None:
-    """Replace each of the ``codes`` by the one that ``others`` has for it."""
+def recode(codes: NDArray[np.uint32], new_codes: NDArray[np.uint32]) -> None:
+    """Replace each code of ``codes`` by ``new_codes[code]``, in place."""
 
 # What is simulated (core/simulation/description.hpp). Parts are made with the fields that differ
 # from the default, and refer to each other by their places in the lists of a `Description`. Times
@@ -337,14 +347,14 @@ FOREVER_NS: int
 """Later than anything that happens in a simulation."""
 
 class Role(Enum):
-    """Who works in a thread."""
+    """What a thread is for."""
 
     executor = 0
     publisher = 1
     dds = 2
 
 class ExecutorKind(Enum):
-    """In which order an executor does what is ready."""
+    """In which order an executor runs callbacks that are ready."""
 
     single_threaded = 0
     static_single_threaded = 1
@@ -368,7 +378,10 @@ class Body(Enum):
     synchronise = 3
 
 class CoreDescription:
-    """A core; ``table`` has offsets in the cycle, and from each on a bit for each open server."""
+    """A core.
+
+    ``table``: offsets in the cycle (ns), and which servers are open from each on, a bit for each.
+    """
 
     table: list[tuple[int, int]]
     open_servers: int
@@ -418,7 +431,7 @@ class ThreadDescription:
     ) -> None: ...
 
 class ProcessDescription:
-    """A process: its executor, and its entities in the order in which that looks at them."""
+    """A process: its executor, and its entities in the order in which the executor checks them."""
 
     executor: ExecutorKind
     first_entity: int

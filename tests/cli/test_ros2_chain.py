@@ -87,6 +87,7 @@ def test_colcon_s_manifest_has_our_version_and_depends_on_what_we_use() -> None:
     assert [name for name in names if not re.search(rf'"(py)?{name}>=', project)] == []
 
 
+@pytest.mark.building
 @pytest.mark.timeout(600)
 def test_colcon_would_install_everything(tmp_path: Path) -> None:
     """What colcon runs for an `ament_python` package, as far as setuptools goes."""

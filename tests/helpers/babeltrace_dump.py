@@ -15,18 +15,18 @@ import bt2  # type: ignore[import-not-found]
 
 def fields(of: Any) -> Any:
     """The numbers, texts and arrays of bytes of a bt2 structure: what a table has columns for."""
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for name in of or ():
         field, kind = of[name], type(of[name]).__name__
         if "String" in kind:
-            found[name] = str(field)
+            values[name] = str(field)
         elif "Integer" in kind or "Enumeration" in kind:
-            found[name] = int(field)
+            values[name] = int(field)
         elif "Array" in kind:
             element = field.cls.element_field_class
             if getattr(element, "field_value_range", 0) == 8:
-                found[name] = [int(item) for item in field]
-    return found
+                values[name] = [int(item) for item in field]
+    return values
 
 
 events, discarded, lost = [], 0, 0

@@ -55,16 +55,18 @@ def contained(
         text=True,
     )
     try:
-        found: list[RunningProcess] = []
+        running: list[RunningProcess] = []
 
         def runs() -> bool:
             assert started.poll() is None, "no such namespaces can be made here"
             inside = [read_process(pid) for pid in children_of(started.pid)]
-            found[:] = [one for one in inside if one and one.command == tuple(command)]
-            return bool(found)
+            running[:] = [
+                process for process in inside if process and process.command == tuple(command)
+            ]
+            return bool(running)
 
         wait_for(runs, "the command in its container")
-        yield started, found[0]
+        yield started, running[0]
     finally:
         for pid in children_of(started.pid):  # process 1 in there: all others end with it
             os.kill(pid, signal.SIGKILL)

@@ -139,8 +139,8 @@ def _encode_array(bits: _Bits, kind: ArrayType, value: Any, depth: int) -> None:
             raise ValueError(f"{len(value)} elements for an array of {kind.length}")
     signed = isinstance(kind.element, IntegerType) and kind.element.signed
     for item in value:
-        one = item - 256 if signed and item > 127 else item
-        _encode(bits, kind.element, one, "", depth + 1)
+        number = item - 256 if signed and item > 127 else item
+        _encode(bits, kind.element, number, "", depth + 1)
 
 
 def encode_packet(
@@ -452,17 +452,17 @@ def write_lttng_trace(
                 record = EventRecord(_full_name(name), time, row, about)
                 records.setdefault(cpu or 0, []).append(record)
         declared, streams = parse_tsdl(text), {}
-        for cpu, found in sorted(records.items()):
-            found.sort(key=lambda record: record.time)
+        for cpu, of_core in sorted(records.items()):
+            of_core.sort(key=lambda record: record.time)
             dropped = discarded_events if not in_kernel and cpu == min(records) else 0
             streams[f"channel_{cpu}"] = [
                 encode_packet(
                     declared,
-                    found[start : start + _PACKET_EVENTS],
+                    of_core[start : start + _PACKET_EVENTS],
                     {"cpu_id": cpu, "packet_seq_num": number, "events_discarded": dropped},
                     instance=cpu,
                 )
-                for number, start in enumerate(range(0, len(found), _PACKET_EVENTS))
+                for number, start in enumerate(range(0, len(of_core), _PACKET_EVENTS))
             ]
         write_trace(folder / part, text, streams)
     return folder

@@ -76,7 +76,9 @@ def _open_and_close(
         while not over.is_set():
             sleep_until(anchor_ns + slot[0])
             os.pwrite(freeze, b"0", 0)
-            sleep_until(anchor_ns + slot[1])
+            # This process may have been kept from running: a slot that opens late ends later.
+            opened_ns = max(anchor_ns + slot[0], time.monotonic_ns())
+            sleep_until(opened_ns + slot[1] - slot[0])
             os.pwrite(freeze, b"1", 0)
             anchor_ns += cycle_ns
     finally:

@@ -142,11 +142,11 @@ def traced_everything(tracer: Tracer, cycles: int) -> tuple[Traced, dict[str, li
     printed = {}
 
     def run_all() -> list[list[str]]:
-        printed.update({version: one.run("every") for version, one in programs.items()})
+        printed.update({version: program.run("every") for version, program in programs.items()})
         return programs["8.2.3"].run("chain", str(cycles))
 
     with pytest.MonkeyPatch.context() as patch:
-        prefixes = (str(one.prefix) for one in programs.values())
+        prefixes = (str(program.prefix) for program in programs.values())
         patch.setenv("AMENT_PREFIX_PATH", ":".join(prefixes))
         return traced(tracer, run_all), printed
 
@@ -162,10 +162,10 @@ def assert_everything(
     assert run.info.distribution == "jazzy"
     for version, rows in printed.items():
         pid = int(rows[0][1])
-        own = of_process(run.tables, pid)
+        tables = of_process(run.tables, pid)
         assert set(left_out) <= {row[0] for row in rows}
-        assert_same(own, [row for row in rows if row[0] not in left_out], version)
-        assert own["rcl_take"].item(0, "tid") != pid
+        assert_same(tables, [row for row in rows if row[0] not in left_out], version)
+        assert tables["rcl_take"].item(0, "tid") != pid
 
 
 def assert_same(tables: Mapping[str, pl.DataFrame], printed: list[list[str]], version: str) -> None:
@@ -189,9 +189,9 @@ def assert_same(tables: Mapping[str, pl.DataFrame], printed: list[list[str]], ve
                 row[column] = list(bytes.fromhex(value))[:16]
             else:
                 row[column] = int(value)
-        found = next(rows[event])
-        assert int(before) <= found["time"] <= int(after), event
-        assert row.items() <= found.items(), event
+        recorded = next(rows[event])
+        assert int(before) <= recorded["time"] <= int(after), event
+        assert row.items() <= recorded.items(), event
     for event, table in tables.items():
         kinds = events.column_types(event)
         assert table.schema == {name: kinds[name] for name in kinds if name in table.columns}
@@ -200,5 +200,5 @@ def assert_same(tables: Mapping[str, pl.DataFrame], printed: list[list[str]], ve
 
 
 def of_process(tables: EventTables, pid: int) -> dict[str, pl.DataFrame]:
-    own = {name: table.filter(pid=pid) for name, table in tables.items()}
-    return {name: table for name, table in own.items() if table.height}
+    tables_of_process = {name: table.filter(pid=pid) for name, table in tables.items()}
+    return {name: table for name, table in tables_of_process.items() if table.height}

@@ -10,6 +10,7 @@ from tempfile import NamedTemporaryFile
 
 import pytest
 from actors import acting
+from containers import needs_namespaces
 from hypothesis import given
 from hypothesis import strategies as st
 from known import known
@@ -220,6 +221,20 @@ def test_descendants_are_children_and_theirs(tmp_path: Path) -> None:
         assert descendants(parents(), actor.pid) == {actor.pid, child}
         assert {actor.pid, child} <= descendants(parents(), os.getpid())
     assert descendants({2: 1, 3: 2, 4: 3, 5: 1}, 2) == {2, 3, 4}
+
+
+@needs_namespaces
+def test_a_process_in_a_user_namespace_without_users_is_read_as_of_no_single_user() -> None:
+    """As every container is for an instant: `unshare` makes the namespace, and then its users."""
+    process = subprocess.Popen(["unshare", "--user", "sleep", "60"])
+    try:
+        command = Path(f"/proc/{process.pid}/cmdline")
+        wait_for(lambda: command.read_bytes() == b"sleep\x0060\0", "sleep in its namespace")
+        assert Path(f"/proc/{process.pid}/uid_map").read_bytes() == b""
+        assert known(read_process(process.pid)).user is None
+    finally:
+        process.kill()
+        process.wait()
 
 
 def test_what_is_gone_or_the_kernels_own_is_no_process() -> None:

@@ -39,10 +39,10 @@ def _running(
 
 def _recorded(output: Path, source: str, processes: Sequence[RunningProcess]) -> set[int]:
     """Record processes for a second; their ids."""
-    words = [word for one in processes for word in ("--pid", str(one.pid))]
+    words = [word for process in processes for word in ("--pid", str(process.pid))]
     made = called("record", "--source", source, "-o", output, "--duration", "600ms", *words)
     assert made.code == 0, made.err
-    return {one.pid for one in processes}
+    return {process.pid for process in processes}
 
 
 def _assert_apart(recording: Path, pids: set[int]) -> None:
@@ -52,8 +52,8 @@ def _assert_apart(recording: Path, pids: set[int]) -> None:
     assert set(started["pid"]) == pids
     assert set(started["tid"]) == pids, "their main threads"
     for pid in pids:
-        own = [one for one in json_of("callbacks", recording, "--json") if one["pid"] == pid]
-        assert [one["tids"] for one in own] == [[pid], [pid]]
+        rows = [row for row in json_of("callbacks", recording, "--json") if row["pid"] == pid]
+        assert [row["tids"] for row in rows] == [[pid], [pid]]
 
 
 def test_two_containers_are_recorded_by_the_library_in_front(tmp_path: Path) -> None:
@@ -62,16 +62,16 @@ def test_two_containers_are_recorded_by_the_library_in_front(tmp_path: Path) -> 
     command = built().command("chain", "60", "--ros-args")
     with ExitStack() as both:
         inside = [_running(both, command, environment, user=user) for user in (False, True)]
-        assert [one.inner_pid for one in inside] == [1, 1]
-        assert {user_of(one.pid) for one in inside} == {0}
+        assert [process.inner_pid for process in inside] == [1, 1]
+        assert {user_of(process.pid) for process in inside} == {0}
         pids = _recorded(tmp_path / "rec", "preload", inside)
         _assert_apart(tmp_path / "rec", pids)
         recording = cs.open_recording(tmp_path / "rec")
         recorded, _ = recorded_processes(recording)
-        assert {one.pid for one in recorded if one.numbered_here} == pids
+        assert {process.pid for process in recorded if process.numbered_here} == pids
         threads = cs.find_threads(recording=recording).threads
         roles = {(t.thread.pid, t.thread.tid, t.thread.role, t.known_by) for t in threads}
-        assert {one for one in roles if one[0] in pids} == {
+        assert {role for role in roles if role[0] in pids} == {
             (pid, pid, "executor", "recording") for pid in pids
         }
 
@@ -113,4 +113,6 @@ def test_containers_of_one_image_are_recorded_once_each_by_ebpf(tmp_path: Path) 
             for time in tables[name].filter(pid=process.pid)["time"]
         ]
         assert len(marks) > 10
-        assert all(one[1] != two[1] for one, two in pairwise(sorted(marks))), "each once"
+        assert all(mark[1] != following[1] for mark, following in pairwise(sorted(marks))), (
+            "each once"
+        )

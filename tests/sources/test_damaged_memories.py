@@ -55,10 +55,10 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def records(count: int, event: str, pid: int) -> NDArray[Any]:
-    found = np.zeros(count, RECORD)
-    found["time"] = time.monotonic_ns() - 1_000_000 + np.arange(count)
-    found["tid"], found["event"], found["values"][:, 0] = pid, NUMBERS[event], np.arange(count)
-    return found
+    rows = np.zeros(count, RECORD)
+    rows["time"] = time.monotonic_ns() - 1_000_000 + np.arange(count)
+    rows["tid"], rows["event"], rows["values"][:, 0] = pid, NUMBERS[event], np.arange(count)
+    return rows
 
 
 def _texts_of(objects: NDArray[Any]) -> NDArray[np.uint8]:
@@ -81,8 +81,8 @@ def whole_memory(pid: int, text: bytes = b"node") -> bytearray:
         objects["values"][1 + place] = 0
         objects["values"][1 + place, 0] = 16 * len(said) + 2 + place
         _texts_of(objects)[1 + place, : len(said)] = [*said]
-    own = np.concatenate([np.r_[records(5, "rcl_take", pid), np.zeros(3, RECORD)]] * RINGS)
-    return bytearray(header.tobytes() + rings.tobytes() + objects.tobytes() + own.tobytes())
+    of_rings = np.concatenate([np.r_[records(5, "rcl_take", pid), np.zeros(3, RECORD)]] * RINGS)
+    return bytearray(header.tobytes() + rings.tobytes() + objects.tobytes() + of_rings.tobytes())
 
 
 def damaged_memory(chance: random.Random, pid: int) -> bytes:
@@ -148,8 +148,8 @@ def test_memories_of_any_content_cost_no_other_process_an_event(tmp_path: Path) 
         recording = recorded(tracer, path)
         for name in recording.events:
             assert recording.events[name].height, "it can be read back"
-        own = recording.events["rcl_take"].filter(pid=7)
-        assert sorted(own["message"]) == sorted([*range(5)] * RINGS)
+        taken = recording.events["rcl_take"].filter(pid=7)
+        assert sorted(taken["message"]) == sorted([*range(5)] * RINGS)
         assert good.damage is None
         assert good.lost == 0
         if bad is not None and bad.damage is not None:
@@ -177,15 +177,15 @@ def test_what_stands_before_a_bad_record_is_there_and_what_follows_is_counted(
 ) -> None:
     memory = whole_memory(7)
     behind = len(memory) - RINGS * RING_RECORDS * RECORD.itemsize
-    own = np.frombuffer(memory, RECORD, RINGS * RING_RECORDS, behind)
-    own[field][3] = value  # of the first ring
+    ring_records = np.frombuffer(memory, RECORD, RINGS * RING_RECORDS, behind)
+    ring_records[field][3] = value  # of the first ring
     tracer = PreloadTracer(tmp_path, ["command"], ())
     add(tracer, bytes(memory), 7)
     recording = recorded(tracer, tmp_path / "recording")
     assert recording.events["rcl_take"]["message"].to_list() == [0, 1, 2]
     assert recording.info.lost == {"lost_events": 2 + 5}
     assert recording.info.processes == {7: "/node"}
-    (note,) = (one for one in recording.info.notes if "left out" in one)
+    (note,) = (note for note in recording.info.notes if "left out" in note)
     assert note.startswith("process 7 (unknown): from where it has a record of event ")
 
 

@@ -105,15 +105,15 @@ def assert_chain(flow: DataFlow, printed: list[list[str]]) -> None:
 def assert_attached(program: Program, folder: Path, distribution: str) -> None:
     """Attach to one of two that run: its chain is found, then with DDS discovery its nodes."""
     folder.mkdir()
-    wanted, other = (program.waiting("chain", str(CYCLES), "wait") for _ in range(2))
+    wanted, bystander = (program.waiting("chain", str(CYCLES), "wait") for _ in range(2))
 
     def both() -> list[list[str]]:
-        for process in (other, wanted):
+        for process in (bystander, wanted):
             out, _ = process.communicate("go\n", timeout=60)
         return [line.split("\t") for line in out.splitlines()]
 
     run = traced(EbpfTracer(folder, (), (wanted.pid,)), both)
-    pids = {one for name, t in run.tables.items() if name != "sched_switch" for one in t["pid"]}
+    pids = {pid for name, t in run.tables.items() if name != "sched_switch" for pid in t["pid"]}
     assert pids == {wanted.pid}
     assert (run.info.rmw, run.info.distribution) == ("rmw_test_cpp", distribution)
     assert any("tracing began while the application ran" in note for note in run.info.notes)
@@ -175,7 +175,9 @@ def test_of_strangers_nothing_is_recorded_or_run_unless_they_are_named(
     processes: list[subprocess.Popen[str]] = []
 
     def start() -> list[int]:
-        processes.extend(program.waiting("chain", "3", "wait", user=one) for one in (None, NOBODY))
+        processes.extend(
+            program.waiting("chain", "3", "wait", user=user) for user in (None, NOBODY)
+        )
         return [process.pid for process in processes]
 
     def run() -> list[list[str]]:
@@ -183,8 +185,8 @@ def test_of_strangers_nothing_is_recorded_or_run_unless_they_are_named(
             processes.pop().communicate("go\n", timeout=60)
         return []
 
-    def progress(_: float, what: str) -> None:
-        if "recording" in what:
+    def progress(_: float, phase: str) -> None:
+        if "recording" in phase:
             run()
 
     ours, strangers = start()
@@ -247,12 +249,12 @@ def test_the_end_of_bpftrace_is_noticed_and_what_it_wrote_is_read(
 
 def bpftrace_of(parent: int) -> int:
     """The tracer's bpftrace: it alone has been given the script."""
-    (found,) = (
+    (bpftrace,) = (
         child
         for child in children_of(parent)
         if b"events.bt" in Path(f"/proc/{child}/cmdline").read_bytes()
     )
-    return found
+    return bpftrace
 
 
 def test_bpftrace_ends_when_the_tracer_is_killed(few: Program, tmp_path: Path) -> None:

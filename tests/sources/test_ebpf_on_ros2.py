@@ -18,10 +18,10 @@ def nodes(in_ros2: None) -> Iterator[list[int]]:
     """Processes of a talker and a listener."""
     skip_without_bpftrace()
     package = ["ros2", "pkg", "prefix", PACKAGE]
-    found = subprocess.run(package, capture_output=True, text=True, check=False)
-    if found.returncode:
+    prefix = subprocess.run(package, capture_output=True, text=True, check=False)
+    if prefix.returncode:
         pytest.skip(f"the package {PACKAGE} is not installed in this ROS 2")
-    folder = Path(found.stdout.strip()) / "lib" / PACKAGE
+    folder = Path(prefix.stdout.strip()) / "lib" / PACKAGE
     running = [
         subprocess.Popen(
             [folder / name, "--ros-args", "-r", "__ns:=/traced", "-r", "chatter:=/traced/chatter"],
@@ -45,15 +45,18 @@ def test_running_nodes_get_their_names_topics_and_callbacks(
     pids = [argument for pid in nodes for argument in ("--pid", str(pid))]
     made = called("record", "--source", "ebpf", "-o", recording, "--duration", "8s", *pids)
     assert made.code == 0, made.err
-    found = {
-        (one["node"], one["kind"], one["topic"]): one
-        for one in json_of("callbacks", recording, "--json")
+    callbacks = {
+        (row["node"], row["kind"], row["topic"]): row
+        for row in json_of("callbacks", recording, "--json")
     }
-    timer = found["/traced/talker", "timer", None]
-    reader = found["/traced/listener", "subscription", "/traced/chatter"]
+    timer = callbacks["/traced/talker", "timer", None]
+    reader = callbacks["/traced/listener", "subscription", "/traced/chatter"]
     assert 0 < reader["execution_ns"]["mean"] <= reader["response_ns"]["mean"]
     assert abs(reader["count"] - timer["count"]) <= 1
-    functions = {one["kind"]: one["symbol"] for one in json_of("graph", recording)["callbacks"]}
+    functions = {
+        callback["kind"]: callback["symbol"]
+        for callback in json_of("graph", recording)["callbacks"]
+    }
     assert "Talker" in functions["timer"]
     contents = json_of("info", recording, "--json")
     assert sorted(contents["processes"].values()) == ["/traced/listener", "/traced/talker"]

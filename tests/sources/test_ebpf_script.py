@@ -40,8 +40,12 @@ def library(version: str | None) -> TracingLibrary:
 
 
 def point(event: str, version: str | None = "8.2.3") -> TracePoint:
-    (found,) = (one for one in trace_points([library(version)]) if one.event == event)
-    return found
+    (trace_point,) = (
+        trace_point
+        for trace_point in trace_points([library(version)])
+        if trace_point.event == event
+    )
+    return trace_point
 
 
 @pytest.mark.waiting
@@ -64,7 +68,7 @@ def test_bpftrace_accepts_the_script_of_a_distribution_that_is_not_traced_here(
 def test_events_are_limited_to_processes_and_what_they_start_or_else_to_users() -> None:
     """And only exported functions get a probe."""
     few = TracingLibrary(Path("/lib.so"), frozenset({"ros_trace_callback_end", "other"}), None)
-    assert [one.event for one in trace_points([few])] == ["callback_end"]
+    assert [trace_point.event for trace_point in trace_points([few])] == ["callback_end"]
     points = trace_points([library("8.2.3")])
 
     def limits(script: str) -> set[str]:
@@ -167,8 +171,8 @@ def test_lines_of_other_cores_are_sorted_and_bpftraces_own_are_left_out(tmp_path
         f"{FIRST_POINT}\t40",  # it was killed here
         ahead_ns=100,
     )
-    other = tmp_path / "said.log"
-    other.write_text("Lost 1 events\n")
+    log = tmp_path / "said.log"
+    log.write_text("Lost 1 events\n")
     assert printed.tables["callback_end"].rows() == [(900, 7, 7, 0, 5), (2900, 7, 8, 1, 2**47 - 1)]
     switches = printed.tables["sched_switch"]
     assert switches.select("time", "prev_tid", "next_tid", "next_prio").rows() == [
@@ -176,7 +180,7 @@ def test_lines_of_other_cores_are_sorted_and_bpftraces_own_are_left_out(tmp_path
         (2400, None, 8, None),
     ]
     assert switches.row(0, named=True)["next_comm"] == 'node with "'
-    assert lost_events(tmp_path / "events.txt", other, tmp_path / "absent") == 43
+    assert lost_events(tmp_path / "events.txt", log, tmp_path / "absent") == 43
 
 
 def test_names_of_handles_come_with_their_event_and_versions_from_the_librarys_package(

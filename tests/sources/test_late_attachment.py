@@ -24,11 +24,14 @@ MS = 1_000_000
 
 def tables_of(rows: Iterable[tuple[str, Mapping[str, Any]]]) -> dict[str, pl.DataFrame]:
     """Event tables from events in any order; a row without a thread is of THREAD."""
-    found: dict[str, list[dict[str, Any]]] = {}
+    rows_of: dict[str, list[dict[str, Any]]] = {}
     for name, values in rows:
-        found.setdefault(name, []).append({"pid": PID, "tid": THREAD, **values})
-    schemas = {name: events.empty(name).schema for name in found}
-    return {name: pl.DataFrame(own, schemas[name]).sort("time") for name, own in found.items()}
+        rows_of.setdefault(name, []).append({"pid": PID, "tid": THREAD, **values})
+    schemas = {name: events.empty(name).schema for name in rows_of}
+    return {
+        name: pl.DataFrame(event_rows, schemas[name]).sort("time")
+        for name, event_rows in rows_of.items()
+    }
 
 
 def instance(
@@ -120,15 +123,15 @@ def test_functions_belong_to_callbacks_from_when_these_were_added() -> None:
     named = with_functions(tables, functions, 50 * MS)
     rows = named["rclcpp_callback_register"].select("time", "callback", "symbol").rows()
     assert rows == [(50 * MS, READER, "Relay::on_x()"), (70 * MS, TIMER, "Source::tick()")]
-    symbols = {one.handle: one.symbol for one in application_graph(named).callbacks}
+    symbols = {callback.handle: callback.symbol for callback in application_graph(named).callbacks}
     assert symbols[TIMER] == "Source::tick()"
     assert with_functions(tables, {}, 50 * MS) == tables
 
 
 def test_the_rmws_own_topics_and_recordings_without_handles_change_nothing() -> None:
     irregular = tables_of(row for at in (1, 2, 90, 95, 300) for row in instance(at * MS, LAMBDA))
-    own = handles(("rmw_publish", 0x100, "ros_discovery_info"))
-    tables, notes = with_found_objects(irregular, own, began_ns=0)
+    rmw_handles = handles(("rmw_publish", 0x100, "ros_discovery_info"))
+    tables, notes = with_found_objects(irregular, rmw_handles, began_ns=0)
     assert tables is irregular
     assert notes == ()
     assert callbacks(tables)[LAMBDA] == ("unknown", None, None)
@@ -177,19 +180,19 @@ def test_two_nodes_of_one_process_are_told_apart_by_their_topics() -> None:
         endpoint("/second", "publisher", "/rosout"),
         endpoint("/front/first", "publisher", "/rosout"),
     ]
-    found, info = with_found_nodes(tables, INFO, graph, [container(("container",))])
-    assert nodes_of(found) == {TIMER: "/front/first", READER: "/second"}
+    with_nodes, info = with_found_nodes(tables, INFO, graph, [container(("container",))])
+    assert nodes_of(with_nodes) == {TIMER: "/front/first", READER: "/second"}
     assert info.processes == {PID: "/front/first, /second"}
     assert info.notes == ()
-    owners = dict(found["rcl_publisher_init"].select("topic_name", "node_handle").iter_rows())
+    owners = dict(with_nodes["rcl_publisher_init"].select("topic_name", "node_handle").iter_rows())
     assert owners["/rosout"] is None
 
 
 def test_without_the_graph_the_only_node_that_a_command_line_names_has_everything() -> None:
     tables, _ = with_found_objects(chain(), CHAIN_HANDLES, began_ns=0)
     command = ("program", "--ros-args", "-r", "__node:=both", "-r", "__ns:=/rear")
-    found, info = with_found_nodes(tables, INFO, (), [container(command)])
-    assert nodes_of(found) == {TIMER: "/rear/both", READER: "/rear/both"}
+    with_nodes, info = with_found_nodes(tables, INFO, (), [container(command)])
+    assert nodes_of(with_nodes) == {TIMER: "/rear/both", READER: "/rear/both"}
     assert info.processes == {PID: "/rear/both"}
 
 
@@ -200,8 +203,8 @@ def test_what_is_not_certain_stays_open_and_is_said() -> None:
         endpoint("/two", "publisher", "/a"),
         endpoint("/two", "publisher", "/b"),
     ]
-    found, info = with_found_nodes(tables, INFO, graph, [container(("program",))])
-    owners = dict(found["rcl_publisher_init"].select("topic_name", "node_handle").iter_rows())
+    with_nodes, info = with_found_nodes(tables, INFO, graph, [container(("program",))])
+    owners = dict(with_nodes["rcl_publisher_init"].select("topic_name", "node_handle").iter_rows())
     assert owners["/a"] == owners["/b"] == 1  # of the two only /two is known to live there
     nothing, info = with_found_nodes(tables, INFO, (), [container(("program",))])
     assert nodes_of(nothing) == dict.fromkeys((TIMER, READER), f"unknown (process {PID})")

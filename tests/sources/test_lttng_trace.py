@@ -64,32 +64,32 @@ def test_tables_come_back_as_they_were_written(tmp_path: Path) -> None:
     tables = shifted(story)
     assert set(recording.events) == set(tables)
     for name, frame in tables.items():
-        found = recording.events[name]
+        table = recording.events[name]
         types = {**events.COMMON_COLUMNS, **events.FIELDS[name]}
-        assert dict(found.schema) == {c: types[c] for c in found.columns}
-        assert found.select(frame.columns).rows() == frame.rows()
+        assert dict(table.schema) == {c: types[c] for c in table.columns}
+        assert table.select(frame.columns).rows() == frame.rows()
     assert recording.info.source == "lttng"
     assert recording.info.clock_offset_ns == OFFSET
     assert recording.info.host == "example"
     assert recording.info.processes == {10: "/a", 11: "/b"}
     counts = Counter(name for name, *_ in babeltrace(tmp_path / "trace")["events"])
     assert json_of("info", tmp_path / "trace")["events"] == dict(sorted(counts.items()))
-    found = json_of("latency", tmp_path / "trace", "--chain", "/x../y", "--instances")
-    assert (found["count"], found["incomplete"], found["min_ns"], found["max_ns"]) == (
+    latency = json_of("latency", tmp_path / "trace", "--chain", "/x../y", "--instances")
+    assert (latency["count"], latency["incomplete"], latency["min_ns"], latency["max_ns"]) == (
         5,
         0,
         300,
         300,
     )
-    assert found["instances"][0]["start_ns"] == START + 1000 + OFFSET
+    assert latency["instances"][0]["start_ns"] == START + 1000 + OFFSET
 
 
 def test_folders_of_processes_are_merged_by_time(tmp_path: Path) -> None:
     """Per-pid buffers: every process has a folder of its own, below one path or given apart."""
     tables = shifted(chain_story())
     for pid in (10, 11):
-        own = {name: frame.filter(pid=pid) for name, frame in tables.items()}
-        write_lttng_trace(tmp_path / "trace" / f"pid-{pid}", own, clock_offset_ns=OFFSET)
+        of_process = {name: frame.filter(pid=pid) for name, frame in tables.items()}
+        write_lttng_trace(tmp_path / "trace" / f"pid-{pid}", of_process, clock_offset_ns=OFFSET)
     together = open_source(tmp_path / "trace")
     apart = open_source(tmp_path / "trace" / "pid-10", tmp_path / "trace" / "pid-11")
     for recording in (together, apart):
@@ -114,7 +114,7 @@ def test_execution_times_from_a_kernel_trace_beside_user_space(tmp_path: Path) -
     alone = open_source(trace / "ust")
     statistics = callback_statistics(data_flow(alone.events))
     assert statistics["execution_ns"].null_count() == 2
-    (stream,) = (one for one in (trace / "kernel").iterdir() if one.name != "metadata")
+    (stream,) = (file for file in (trace / "kernel").iterdir() if file.name != "metadata")
     os.truncate(stream, stream.stat().st_size - 10)
     notes = open_source(trace).info.notes
     assert any(str(stream) in note for note in notes), "said though it is read late"
@@ -256,7 +256,7 @@ def test_containers_with_the_same_process_numbers_are_told_apart(
     of_later = "host two" if hosts[1] == "two" else f"host in {tmp_path / '2'}"
     assert any(f"{of_later} have" in note for note in recording.info.notes)
     graph = application_graph(recording.events)
-    assert {(one.node, one.pid) for one in graph.callbacks} == {
+    assert {(callback.node, callback.pid) for callback in graph.callbacks} == {
         *(("/a", 10), ("/b", 11), ("/c", moved), ("/d", moved + 1))
     }
     for chain in ("/a../b../y", "/c../d../y"):
@@ -267,8 +267,8 @@ def test_containers_with_the_same_process_numbers_are_told_apart(
 def test_hosts_with_different_process_numbers_keep_them(tmp_path: Path) -> None:
     tables = shifted(chain_story())
     for pid, host in ((10, "one"), (11, "two")):
-        own = {name: frame.filter(pid=pid) for name, frame in tables.items()}
-        write_lttng_trace(tmp_path / "trace" / host, own, clock_offset_ns=OFFSET, host=host)
+        of_process = {name: frame.filter(pid=pid) for name, frame in tables.items()}
+        write_lttng_trace(tmp_path / "trace" / host, of_process, clock_offset_ns=OFFSET, host=host)
     recording = open_source(tmp_path / "trace")
     assert recording.info.processes == {10: "/a", 11: "/b"}
     assert recording.info.notes == ()

@@ -193,8 +193,8 @@ def test_cpu_time_is_the_clocks_though_that_is_rarely_read(
 
     monkeypatch.setenv("GLIBC_TUNABLES", tunables)
     table = traced(tracer_of(tmp_path), run).tables["callback_start"]
-    (child_before, child_after), *own = np.array(printed, np.int64)
-    before, after = np.array(own).T
+    (child_before, child_after), *of_parent = np.array(printed, np.int64)
+    before, after = np.array(of_parent).T
     parts = table.partition_by("pid", maintain_order=True)
     of_child, said = (
         part["thread_time"].to_numpy() for part in sorted(parts, key=lambda part: part.height)
@@ -286,8 +286,8 @@ def memory_behind(program: str) -> Iterator[Path]:
         assert process.stdout is not None
         assert int(process.stdout.readline()) == process.pid
         files = Path(f"/proc/{process.pid}/fd").iterdir()
-        (found,) = (one for one in files if "chainshaper-trace" in str(one.readlink()))
-        yield found
+        (memory_file,) = (file for file in files if "chainshaper-trace" in str(file.readlink()))
+        yield memory_file
         process.communicate("\n")
 
 
@@ -326,9 +326,9 @@ def test_a_process_of_another_clock_is_refused_and_named(tmp_path: Path, ahead_s
         subprocess.run(command, check=True, timeout=60)
         return []
 
-    found = traced(tracer_of(tmp_path), run)
-    assert taken(found) == list(range(5))
-    (note,) = (one for one in found.info.notes if one.startswith("nothing of process"))
+    recorded = traced(tracer_of(tmp_path), run)
+    assert taken(recorded) == list(range(5))
+    (note,) = (note for note in recorded.info.notes if note.startswith("nothing of process"))
     assert "another clock, that of a time namespace" in note
     assert re.match(r"nothing of process \d+ \(python[\d.]*\) is recorded: ", note)
 
@@ -408,11 +408,11 @@ def test_a_running_process_of_another_clock_is_named_where_it_is_attached_to(
             seen = watched.look()
         (note,) = info.notes
         assert re.fullmatch(left_out + r"\.", note)
-        assert [one for one in seen.left_out if re.match(left_out, one)]
+        assert [sentence for sentence in seen.left_out if re.match(left_out, sentence)]
         assert here in seen.processes
         assert f"process {pid} " in (watch_tables(seen)[-1].caption or "")
     watched._searched_ns = 0  # it looks again, and the process has ended
-    assert not [one for one in watched.look().left_out if re.match(left_out, one)]
+    assert not [sentence for sentence in watched.look().left_out if re.match(left_out, sentence)]
 
 
 FLOOD = """
@@ -523,13 +523,13 @@ def test_every_event_is_there_or_counted(
 ) -> None:
     """Children have memories of their own; threads that end give their rings back."""
     run = traced(tracer_of(tmp_path), lambda: python(program))
-    found = run.tables["rcl_take"].group_by("pid").agg("message")["message"].to_list()
-    assert all(len(set(own)) == len(own) for own in found), "none twice"
+    messages_of = run.tables["rcl_take"].group_by("pid").agg("message")["message"].to_list()
+    assert all(len(set(messages)) == len(messages) for messages in messages_of), "none twice"
     counted = run.info.lost["lost_events"]
     if lost is None:
-        assert len(found[0]) + counted == by_process[0]
+        assert len(messages_of[0]) + counted == by_process[0]
     else:
-        assert (sorted(map(len, found), reverse=True), counted) == (by_process, lost)
+        assert (sorted(map(len, messages_of), reverse=True), counted) == (by_process, lost)
     assert ("events were lost" in "".join(run.info.notes)) == (counted > 0)
 
 
@@ -756,7 +756,7 @@ def test_the_command_records_and_the_chain_is_measured(tmp_path: Path) -> None:
     measured = json_of("latency", recording, "--chain", "/ebpf1../ebpf2", "--json")
     assert measured["count"] >= CYCLES - 1
     callbacks = json_of("callbacks", recording, "--json")
-    assert all(2_000_000 <= one["execution_ns"]["mean"] < 3_000_000 for one in callbacks)
+    assert all(2_000_000 <= callback["execution_ns"]["mean"] < 3_000_000 for callback in callbacks)
     assert json_of("info", recording, "--json")["source"] == "preload"
 
 
@@ -768,7 +768,7 @@ def test_what_runs_with_the_library_is_attached_to_and_left(tmp_path: Path) -> N
     )  # ten seconds: `record` takes its time on a busy machine
     with (
         subprocess.Popen(words, env=environment, stdout=subprocess.PIPE) as process,
-        subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL) as other,
+        subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL) as bystander,
     ):
         time.sleep(0.7)
         begun = time.monotonic_ns()
@@ -776,7 +776,7 @@ def test_what_runs_with_the_library_is_attached_to_and_left(tmp_path: Path) -> N
         made = called("record", "--source", "preload", "-o", tmp_path / "rec", *attach)
         assert (made.code, process.poll()) == (0, None), made.err
         printed = process.communicate()[0]
-        other.kill()
+        bystander.kill()
     assert printed.count(b"instance") == 400
     tables = cs.open_recording(tmp_path / "rec").events
     started = tables["callback_start"]

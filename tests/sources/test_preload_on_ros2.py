@@ -64,15 +64,15 @@ def test_events_are_those_of_lttng_one_by_one(
     assert {"rmw_take", "rmw_publish", "callback_end", "rclcpp_callback_register"} <= theirs.keys()
     ended = max(int(table["time"][-1]) for table in theirs.values())
     for name, table in theirs.items():
-        same = [one for one in table.columns if one in ours[name].columns]
-        same = [one for one in same if one not in ("time", "cpu")]
+        same = [column for column in table.columns if column in ours[name].columns]
+        same = [column for column in same if column not in ("time", "cpu")]
         threads = ours[name].partition_by("pid", "tid", as_dict=True, maintain_order=True)
         for thread, expected in table.group_by("pid", "tid", maintain_order=True):
-            found = threads[thread]
-            assert (found["time"][expected.height :] > ended - 1_000_000_000).all(), name
-            found = found.head(expected.height)
-            assert cut(found.select(same)).equals(cut(expected.select(same))), (name, thread)
-            assert (found["time"] <= expected["time"]).all(), "ours is written first"
+            recorded = threads[thread]
+            assert (recorded["time"][expected.height :] > ended - 1_000_000_000).all(), name
+            recorded = recorded.head(expected.height)
+            assert cut(recorded.select(same)).equals(cut(expected.select(same))), (name, thread)
+            assert (recorded["time"] <= expected["time"]).all(), "ours is written first"
     assert info.distribution == done.recording.info.distribution
     assert info.rmw in (None, done.recording.info.rmw)
 
@@ -160,7 +160,7 @@ def test_a_launch_in_a_container_is_recorded_under_the_numbers_of_here(
         tmp_path / "rec", in_container(launch), source="preload", duration_ns=SECONDS * SECOND
     )
     tables, info = done.recording.events, done.recording.info
-    executing = {(one.pid, one.tid) for one in info.threads if one.role == "executor"}
+    executing = {(thread.pid, thread.tid) for thread in info.threads if thread.role == "executor"}
     started = set(tables["callback_start"].select("pid", "tid").unique().iter_rows())
     assert started <= executing
     assert min(pid for pid, _ in executing) > 100, "in there they are among the first"

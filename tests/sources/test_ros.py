@@ -107,16 +107,16 @@ def application(tmp_path: Path) -> Environment:
 
 
 def test_types_and_qos_of_every_endpoint_are_told(application: Environment) -> None:
-    found, problem = ask_graph(application)
+    endpoints, problem = ask_graph(application)
     assert problem is None
     common = {"topic": "/t1", "type": "sensor_msgs/msg/Image", "liveliness": "automatic"}
     reliable = {"reliability": "reliable", "durability": "volatile", "history": "keep_last"}
     latched = {"reliability": "best_effort", "durability": "transient_local", "history": "unknown"}
-    one = {**common, **reliable, "node": "/node1", "kind": "publisher", "depth": 10}
-    other = {**common, **latched, "node": "/front/node2", "kind": "subscription", "depth": 0}
-    publisher = EndpointInfo.model_validate(one)
-    subscription = EndpointInfo.model_validate({**other, "deadline_ns": 100_000_000})
-    assert found == (publisher, publisher, subscription)  # two publishers stay two
+    node1 = {**common, **reliable, "node": "/node1", "kind": "publisher", "depth": 10}
+    node2 = {**common, **latched, "node": "/front/node2", "kind": "subscription", "depth": 0}
+    publisher = EndpointInfo.model_validate(node1)
+    subscription = EndpointInfo.model_validate({**node2, "deadline_ns": 100_000_000})
+    assert endpoints == (publisher, publisher, subscription)  # two publishers stay two
 
 
 def endpoint(node: str, topic: str, depth: str) -> str:
@@ -146,8 +146,8 @@ def test_a_strangers_answer_is_no_more_than_ros_2_can_say(
     (tmp_path / "answer").write_text(answer)
     (tmp_path / "say").write_text(f"exec /bin/cat {tmp_path}/answer")
     (tmp_path / "ros2").write_text(f"#!/bin/sh {tmp_path}/say\n")
-    found, problem = ask_graph(application)
-    assert len(found) == count
+    endpoints, problem = ask_graph(application)
+    assert len(endpoints) == count
     assert problem is None or "answer" not in problem, "it has been asked"
 
 
@@ -155,13 +155,13 @@ def test_a_graph_that_cannot_be_asked_is_no_more_than_a_reason(
     application: Environment, tmp_path: Path
 ) -> None:
     variables = {**application.variables, "RMW_IMPLEMENTATION": "rmw_connextdds"}
-    found, problem = ask_graph(replace(application, variables=variables))
-    assert (found, problem) == ((), "RuntimeError: another environment than the node's")
+    endpoints, problem = ask_graph(replace(application, variables=variables))
+    assert (endpoints, problem) == ((), "RuntimeError: another environment than the node's")
     (tmp_path / "rclpy.py").unlink()
     assert ask_graph(application) == ((), "ModuleNotFoundError: No module named 'rclpy'")
     (tmp_path / "ros2").unlink()
-    found, problem = ask_graph(application)
-    assert found == ()
+    endpoints, problem = ask_graph(application)
+    assert endpoints == ()
     assert problem is not None
     assert "python3: not found" in problem
 
@@ -169,8 +169,8 @@ def test_a_graph_that_cannot_be_asked_is_no_more_than_a_reason(
 def test_the_environment_of_a_process_is_what_it_was_started_with() -> None:
     process = subprocess.Popen(["sleep", "60"], env={"ROS_DOMAIN_ID": "7", "EMPTY": ""})
     try:
-        found = environment_of(process.pid)
-        assert found == Environment({"ROS_DOMAIN_ID": "7", "EMPTY": ""}, os.geteuid())
+        environment = environment_of(process.pid)
+        assert environment == Environment({"ROS_DOMAIN_ID": "7", "EMPTY": ""}, os.geteuid())
     finally:
         process.kill()
         process.wait()

@@ -135,13 +135,13 @@ def test_two_sessions_that_recorded_the_same_events_are_refused(
     tmp_path: Path, later_ns: int
 ) -> None:
     tables = chain_tables()
-    one = write_chain(tmp_path / "both" / "one", tables)
-    two = write_chain(tmp_path / "both" / "two", moved(tables, later_ns), 17, uuid=7)
-    for folders in ([tmp_path / "both"], [one, two]):
+    first = write_chain(tmp_path / "both" / "one", tables)
+    second = write_chain(tmp_path / "both" / "two", moved(tables, later_ns), 17, uuid=7)
+    for folders in ([tmp_path / "both"], [first, second]):
         for verb in (["info"], ["callbacks"], ["latency", *CHAIN]):
             said = refused(2, verb[0], *folders, *verb[1:])
-            assert str(one) in said
-            assert str(two) in said
+            assert str(first) in said
+            assert str(second) in said
             assert "hold the same events" in said
 
 

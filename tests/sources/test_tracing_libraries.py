@@ -36,16 +36,16 @@ def test_every_prefix_of_the_environment_is_searched_and_a_file_counts_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     jazzy, humble = built(), built("-DHUMBLE", version="4.1.1")
-    for name, one in (("jazzy", jazzy), ("humble", humble)):
-        (tmp_path / name).symlink_to(one.prefix)
+    for name, program in (("jazzy", jazzy), ("humble", humble)):
+        (tmp_path / name).symlink_to(program.prefix)
     monkeypatch.setattr(tracing_library, "_INSTALLATIONS", tmp_path)  # finds both once more
-    found = installed_libraries(
+    libraries = installed_libraries(
         {
             "AMENT_PREFIX_PATH": f"{tmp_path}/nothing:{jazzy.prefix}:",
             "LD_LIBRARY_PATH": f"{jazzy.prefix}/lib/../lib",
         }
     )
-    assert [(one.path, one.version, one.major) for one in found] == [
+    assert [(library.path, library.version, library.major) for library in libraries] == [
         (jazzy.tracetools, "8.2.3", 8),
         (tmp_path / "humble/lib/libtracetools.so", "4.1.1", 4),
     ]
@@ -81,10 +81,10 @@ def _named(program: Path) -> list[str | None]:
     ) as running:
         assert running.stdout is not None
         handles = [int(running.stdout.readline()) for _ in range(7)]
-        found = callback_functions((running.pid, handle) for handle in handles)
+        functions = callback_functions((running.pid, handle) for handle in handles)
         running.communicate()
     assert callback_functions([(running.pid, handles[0]), (0, 4096)]) == {}, "it has ended"
-    return [found.get((running.pid, handle)) for handle in handles]
+    return [functions.get((running.pid, handle)) for handle in handles]
 
 
 def test_functions_are_named_as_lttng_would_name_them(tmp_path: Path) -> None:

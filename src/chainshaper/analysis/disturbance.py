@@ -119,8 +119,10 @@ def _expected(flow: DataFlow, traversals: Traversals, period_ns: int | None) -> 
     """When the timer that starts each traversal was due (ns); without a timer its start."""
     if period_ns is None:
         return pl.col("start")
-    first = flow.instances.filter(pl.col("callback_id") == traversals.chain.callbacks[0])
-    processes = first.sort("start").partition_by("pid")  # each has its own timer
+    instances = flow.instances.lazy()
+    first = instances.filter(pl.col("callback_id") == traversals.chain.callbacks[0])
+    starts = first.select("pid", "start").collect()
+    processes = starts.sort("start").partition_by("pid")  # each has its own timer
     due = [
         of_process.select("start", expected=timer_due(of_process["start"], period_ns))
         for of_process in processes

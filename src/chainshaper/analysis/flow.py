@@ -48,10 +48,8 @@ from chainshaper.values.application import INTERNAL_TOPICS, REQUEST, RESPONSE
 from chainshaper.values.recording import Recording
 
 _ACTION = "/_action/"
-_SPENT = ("callback_start", "callback_end", "rmw_publish", "rmw_take")
-"""The largest tables. What the analysis needs of them is in the data flow."""
 MANY_ROWS = 1_000_000
-"""Tables with more rows (tens of MB each) leave memory once the data flow is there."""
+"""Tables with more rows (tens of MB each) leave memory when the data flow has what they say."""
 
 
 @dataclass(frozen=True)
@@ -102,15 +100,13 @@ class DataFlow:
 def recorded_flow(recording: Recording) -> DataFlow:
     """Resolve the events of a recording, with its clock offset and its count of lost events."""
     info = recording.info
-    flow = data_flow(recording.events, info.clock_offset_ns, complete=not any(info.lost.values()))
-    if isinstance(recording.events, events.ReadAgain):
-        recording.events.let_go([name for name in _SPENT if _many_rows(recording.events, name)])
-    return flow
+    return data_flow(recording.events, info.clock_offset_ns, complete=not any(info.lost.values()))
 
 
-def _many_rows(tables: events.EventTables, name: str) -> bool:
-    """Return whether a table is so large that it is better to read it again if it is needed."""
-    return events.table(tables, name).height > MANY_ROWS
+def _let_go(tables: events.EventTables, names: Collection[str]) -> None:
+    """Have large tables leave memory; who wants one of them again waits until it is read again."""
+    if isinstance(tables, events.ReadAgain):
+        tables.let_go([name for name in names if events.table(tables, name).height > MANY_ROWS])
 
 
 def data_flow(
@@ -129,13 +125,18 @@ def data_flow(
     * ``complete``: whether it is certain that no event was lost.
     """
     objects = objects or resolve_objects(tables)
-    with ThreadPoolExecutor(max_workers=1) as beside:  # instances and messages meet only below
-        running = beside.submit(callback_instances, tables, objects.callbacks)
-        sent, received = service_calls(tables, objects, clock_offset_ns)
-        taken = takes(tables, objects, received)
+    # What the frames below need of the largest tables is in them. A table goes before the next
+    # frame is made: all of them together would take half as much memory again.
+    instances = callback_instances(tables, objects.callbacks)
+    _let_go(tables, ["callback_start", "callback_end"])
+    sent, received = service_calls(tables, objects, clock_offset_ns)
+    with ThreadPoolExecutor(max_workers=1) as beside:
+        taking = beside.submit(takes, tables, objects, received)
         published = publications(tables, objects, sent)
-        taken, stamped = link_takes(tables, taken, published, clock_offset_ns)
-        instances = running.result()
+        taken = taking.result()
+    without_rmw = _taken_without_rmw(tables)
+    _let_go(tables, ["rmw_publish", "rmw_take"])
+    taken, stamped = link_takes(tables, taken, published, clock_offset_ns)
     ends = without_disproved_ends(tables, instances, taken, objects.callbacks, complete=complete)
     instances = ends.instances
     instances, taken = _with_assumed_readers(instances, taken, objects, tables)
@@ -160,7 +161,7 @@ def data_flow(
     )
     notes = (
         *objects.notes,
-        *_notes(tables, instances, taken),
+        *_notes(tables, instances, taken, without_rmw),
         *(contradiction.note for contradiction in seen),
     )
     without_takes = frozenset(subscription.callback_id for subscription in unseen)
@@ -182,9 +183,12 @@ def data_flow(
 
 
 def _notes(
-    tables: events.EventTables, instances: pl.DataFrame, taken: pl.DataFrame
+    tables: events.EventTables, instances: pl.DataFrame, taken: pl.DataFrame, without_rmw: int
 ) -> Iterator[str]:
-    """Yield what cannot be known of instances and messages, in plain words."""
+    """Yield what cannot be known of instances and messages, in plain words.
+
+    ``without_rmw`` is what `_taken_without_rmw` returns.
+    """
     if "sched_switch" in tables and instances.height and not instances["execution_ns"].count():
         yield (
             "sched_switch was recorded, but shows none of the application's threads (inside a "
@@ -197,16 +201,20 @@ def _notes(
             "other event tells (before Iron, or not enabled): chains cannot be followed through "
             "them."
         )
-    # Messages that rcl took in processes where rmw has an event of hardly any.
-    by_rmw = taken_by_rmw(tables).group_by("pid").len("by_rmw")
-    by_rcl = events.table(tables, "rcl_take").group_by("pid").len("by_rcl")
-    both = by_rcl.join(by_rmw, on="pid", how="left").fill_null(0)
-    if missing := both.filter(pl.col("by_rcl") > 5 * pl.col("by_rmw"))["by_rcl"].sum():
+    if without_rmw:
         yield (
-            f"{missing} messages were taken without an event of rmw (from Lyrical on"
+            f"{without_rmw} messages were taken without an event of rmw (from Lyrical on"
             " rmw_fastrtps_cpp has none for messages with a field uint8[]): chains are followed"
             " through them only where a note says so. `record --source preload` sees them."
         )
+
+
+def _taken_without_rmw(tables: events.EventTables) -> int:
+    """Count the messages that rcl took in processes where rmw has an event of hardly any."""
+    by_rmw = taken_by_rmw(tables).group_by("pid").len("by_rmw")
+    by_rcl = events.table(tables, "rcl_take").group_by("pid").len("by_rcl")
+    both = by_rcl.join(by_rmw, on="pid", how="left").fill_null(0)
+    return int(both.filter(pl.col("by_rcl") > 5 * pl.col("by_rmw"))["by_rcl"].sum())
 
 
 def left_when_taken(flow: DataFlow, topics: Collection[str | None]) -> DataFlow:
@@ -268,7 +276,7 @@ def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> p
     )
     if frame["callback_id"].null_count():
         frame = frame.drop_nulls("callback_id")
-    if frame["execution_ns"].null_count() == frame.height and "sched_switch" in tables:
+    if "sched_switch" in tables and not frame["execution_ns"].count():
         frame = _plausible(frame.with_columns(execution_ns=cpu_time(tables, frame)))
     return frame.with_row_index("instance")
 
@@ -392,14 +400,13 @@ def _consumed(taken: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
     thread_callback = ["tid", "callback_id"]
     for through_buffer in (False, True):
         same = pl.col("intra_process") == through_buffer
-        began = instances.filter(same & ~pl.col("assumed")).select(
-            *thread_callback, "instance", "start"
-        )
-        received = taken.filter(same).select(*thread_callback, "take", took="time")
+        starts = instances.lazy().filter(same & ~pl.col("assumed"))
+        began = starts.select(*thread_callback, "instance", "start").collect()
+        of_kind = taken.lazy().filter(same)
+        received = of_kind.select(*thread_callback, "take", took="time").collect()
         if began.height and received.height:
-            read = latest_before(began, received, thread_callback, "start", "took").drop_nulls(
-                "take"
-            )
+            read = latest_before(began, received, thread_callback, "start", "took")
+            read = read.select("take", "instance").drop_nulls("take")
             # Of several instances after one take the first read the message. Of several rows with
             # one number `by_number` takes the last, so the order of starts is reversed.
             instance_of_take = by_number(read.reverse(), "take", "instance", taken.height)
@@ -440,8 +447,8 @@ def _published_in(
     """
     nodes = objects.callbacks.unique("callback_id", maintain_order=True)
     nodes = nodes.select("callback_id", owner=pl.col("node").cast(published.schema["node"]))
-    running = instances.join(nodes, on="callback_id", how="left", maintain_order="left")
-    running = running.drop("execution_ns", "intra_process")
+    running = instances.drop("execution_ns", "intra_process")
+    running = running.join(nodes, on="callback_id", how="left", maintain_order="left")
     key, columns = ["pid", "tid"], ["publication", "instance", "callback_id"]
     over_by = pl.coalesce("end", "until")
     lies_inside = (over_by.is_null() | (pl.col("time") <= over_by)) & (
@@ -450,8 +457,9 @@ def _published_in(
     left_over, parts, strictly = published.select("publication", "time", *key, "node"), [], True
     while True:
         matches = latest_before(left_over, running, key, "time", "start", strictly=strictly)
-        matches = matches.filter(lies_inside.fill_null(False) & pl.col("instance").is_not_null())
-        parts.append(matches.select(columns))
+        is_match = lies_inside.fill_null(False) & pl.col("instance").is_not_null()
+        matches = matches.lazy().filter(is_match).select(columns).collect()
+        parts.append(matches)
         instance_of = by_number(matches, "publication", "instance", published.height)
         left_over = left_over.filter(instance_of.gather(left_over["publication"]).is_null())
         # The first search is for instances that began before the publication, the second among the

@@ -65,8 +65,8 @@ def without_disproved_ends(
     rule no other step needs these large tables.
     """
     thread, key = ["pid", "tid"], ["tid", "callback_id"]
-    takes = taken.filter(~pl.col("intra_process")).drop_nulls("callback_id")
-    takes = takes.select(*key, took="time")
+    from_dds = taken.lazy().filter(~pl.col("intra_process")).drop_nulls("callback_id")
+    takes = from_dds.select(*key, took="time").collect()
     rows = first_after(instances, takes, key, "start", "took", strictly=True)
     if not _suspicious(rows):
         return LostEnds(instances.with_columns(until=_NO_TIME), _NONE, _NONE, complete)

@@ -555,6 +555,8 @@ def gated_hops(
     """
     key = ["callback_id", "source_timestamp"]
     decided = with_overrun(gate_decisions(tables, objects), due_cycles).with_columns(let_go="time")
+    if decided.is_empty():  # the joins would copy all hops to find nothing
+        hops = hops.clear()
     reached = hops.select("traversal", "hop", "start", *key)
     columns = [*reached.columns, *(n for n in decided.columns if n not in reached.columns)]
     stamped = reached.drop_nulls(key).join(decided.drop("start"), on=key)

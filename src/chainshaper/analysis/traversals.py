@@ -158,14 +158,20 @@ def traverse(flow: DataFlow, chain: Chain, graph: ApplicationGraph | None = None
 def _begun(flow: DataFlow, first: Callback) -> pl.DataFrame:
     """Begin the state: a row per instance of the first callback, with its take if it has one."""
     of_callback = pl.col("callback_id") == first.id
-    taken = flow.takes.filter(of_callback & pl.col("instance").is_not_null())
-    take = by_number(taken, "instance", "take", flow.instances.height)
-    return flow.instances.filter(of_callback).select(
-        instance_0="instance",
-        take_0=pl.lit(take).gather("instance"),
-        broken_hop=pl.lit(None, dtype=pl.UInt8),
-        reason=pl.lit(None, dtype=_REASON),
+    taken = flow.takes.lazy().filter(of_callback & pl.col("instance").is_not_null())
+    taken_in = taken.select("instance", "take").collect()
+    take = by_number(taken_in, "instance", "take", flow.instances.height)
+    begun = (
+        flow.instances.lazy()
+        .filter(of_callback)
+        .select(
+            instance_0="instance",
+            take_0=pl.lit(take).gather("instance"),
+            broken_hop=pl.lit(None, dtype=pl.UInt8),
+            reason=pl.lit(None, dtype=_REASON),
+        )
     )
+    return begun.collect()
 
 
 def _standby(graph: ApplicationGraph, callback: Callback, topic: str) -> list[int]:
@@ -184,7 +190,8 @@ def _publish(
 ) -> pl.DataFrame:
     """Add the publications of the hop's topic inside each traversal's instance."""
     for_hop = pl.col("callback_id").is_in(callbacks) & (pl.col("topic") == topic)
-    inside = flow.publications.filter(for_hop & pl.col("instance").is_not_null())
+    published = flow.publications.lazy().filter(for_hop & pl.col("instance").is_not_null())
+    inside = published.select("instance", "publication").collect()
     instance, publication = f"instance_{hop}", f"publication_{hop}"
     first = by_number(inside, "instance", "publication", flow.instances.height)
     if first.count() == inside.height:
@@ -348,9 +355,9 @@ def _take(
 
     It is an instance of ``callback``, or of the ``standby`` that published for it.
     """
-    taken = flow.takes.filter(pl.col("publication").is_not_null())
-    by_callback = taken.filter(pl.col("callback_id") == callback.id)
-    by_callback = by_callback.select("publication", "take", "instance")
+    known = flow.takes.lazy().filter(pl.col("publication").is_not_null())
+    columns = ["publication", "take", "instance"]
+    by_callback = known.filter(pl.col("callback_id") == callback.id).select(columns).collect()
     # If a message was taken twice, the first take that led to an execution is followed. Of several
     # rows with one number `by_number` takes the last, so the best ones come last.
     executed = pl.col("instance").is_not_null()
@@ -358,7 +365,7 @@ def _take(
     if standby:
         published = flow.publications.filter(pl.col("topic") == topic)["instance"].drop_nulls()
         passed_on = pl.col("instance").is_in(published.implode())
-        by_standby = taken.filter(pl.col("callback_id").is_in(standby)).select(by_callback.columns)
+        by_standby = known.filter(pl.col("callback_id").is_in(standby)).select(columns).collect()
         layers += [by_standby.filter(passed_on).reverse(), by_callback.filter(passed_on).reverse()]
     taken = pl.concat(layers)
     before, height = pl.col(f"publication_{hop - 1}"), flow.publications.height
@@ -431,28 +438,33 @@ def _hop(flow: DataFlow, chain: Chain, frame: pl.DataFrame, hop: int) -> pl.Data
     publish = _published_at(flow, hop, chain)
     handed_over = _looked_up(flow.publications, "time", f"publication_{hop}")
     waiting += (publish - handed_over).clip(lower_bound=0).fill_null(0)
-    reached = frame.filter(pl.col(instance).is_not_null()).select(
-        "traversal",
-        hop=pl.lit(hop, dtype=pl.UInt8),
-        callback_id=_looked_up(flow.instances, "callback_id", instance),
-        topic=pl.lit(chain.topics[hop], dtype=pl.Enum(list(chain.topics))),
-        instance=instance,
-        take=_looked_up(flow.takes, "time", take),
-        start=start,
-        publish=publish,
-        end=_looked_up(flow.instances, "end", instance),
-        source_timestamp=_looked_up(flow.takes, "source_timestamp", take),
-        communication_ns=sent,
-        waiting_ns=waiting,
-        via=via.cast(_VIA),
+    reached = (
+        frame.lazy()
+        .filter(pl.col(instance).is_not_null())
+        .select(
+            "traversal",
+            hop=pl.lit(hop, dtype=pl.UInt8),
+            callback_id=_looked_up(flow.instances, "callback_id", instance),
+            topic=pl.lit(chain.topics[hop], dtype=pl.Enum(list(chain.topics))),
+            instance=instance,
+            take=_looked_up(flow.takes, "time", take),
+            start=start,
+            publish=publish,
+            end=_looked_up(flow.instances, "end", instance),
+            source_timestamp=_looked_up(flow.takes, "source_timestamp", take),
+            communication_ns=sent,
+            waiting_ns=waiting,
+            via=via.cast(_VIA),
+        )
     )
     published = pl.col("publish").is_not_null()
-    return reached.with_columns(
+    with_parts = reached.with_columns(
         communication_ns=pl.col("start") - pl.col("communication_ns"),
         computation_ns=pl.col("publish") - pl.col("start") - pl.col("waiting_ns"),
         waiting_ns=pl.when(published).then("waiting_ns"),
         via=pl.when(published).then("via"),
     )
+    return with_parts.collect()
 
 
 def _without_holds(flow: DataFlow, hops: pl.DataFrame) -> pl.DataFrame:
@@ -491,9 +503,9 @@ def reception(flow: DataFlow, traversals: Traversals, graph: ApplicationGraph) -
     """
     output = traversals.chain.topics[-1]
     candidates = [callback.id for callback in graph.callbacks if callback.trigger == output]
-    taken = flow.takes.filter(pl.col("callback_id").is_in(candidates))
-    taken = taken.drop_nulls(["publication", "instance"])
-    taken = taken.filter(pl.col("callback_id") == pl.col("callback_id").min())
+    known = flow.takes.lazy().filter(pl.col("callback_id").is_in(candidates))
+    known = known.select("callback_id", "publication", "instance").drop_nulls()
+    taken = known.collect().filter(pl.col("callback_id") == pl.col("callback_id").min())
     # Of several takes the first counts. `by_number` takes the last row, so they are reversed.
     reader = by_number(taken.reverse(), "publication", "instance", flow.publications.height)
     received = flow.instances["start"].gather(reader.gather(traversals.frame["publication"]))

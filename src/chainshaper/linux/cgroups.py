@@ -56,7 +56,7 @@ def mount_options() -> str:
 
 def _mount() -> tuple[Path, str]:
     """Return mount point and options; beside version 1 it is usually /sys/fs/cgroup/unified."""
-    for line in filter(None, lines_of(read_proc(MOUNTS))):
+    for line in lines_of(read_proc(MOUNTS)):
         _, folder, kind, options, *_ = line.split(b" ")
         if kind == b"cgroup2":
             folder = _OCTAL.sub(lambda escaped: bytes([int(escaped[1], 8)]), folder)

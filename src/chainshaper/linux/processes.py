@@ -116,7 +116,7 @@ def user_in(folder: int) -> int | None:
     if started_by is None:  # a process with root's ids may be a set-user-ID program
         return None if user == 0 and os.geteuid() == 0 else user
     starters = {started_by}
-    for line in lines_of(read_proc("uid_map", folder)):  # of its user namespace
+    for line in lines_of(read_proc("uid_map", folder)):  # of its user namespace; empty in a new one
         inside, outside, count = map(int, line.split())
         if inside <= started_by < inside + count:
             starters.add(outside + started_by - inside)
@@ -223,7 +223,7 @@ class Region(NamedTuple):
 
 def regions_in(maps: bytes) -> Iterator[Region]:
     """Yield the regions in the content of a file /proc/PID/maps, by address."""
-    for line in filter(None, lines_of(maps)):
+    for line in lines_of(maps):
         span, rights, offset, _, _, *path = line.split(maxsplit=5)
         start, end = (int(bound, 16) for bound in span.split(b"-"))
         name = os.fsdecode(path[0]) if path else ""  # exactly, so that it can be opened

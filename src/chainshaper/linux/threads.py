@@ -177,9 +177,9 @@ def lines_of(content: bytes) -> list[bytes]:
     """Return the lines of a file of the kernel, which end with a line feed and nothing else.
 
     Names in them may have other characters that end lines elsewhere: with `splitlines`, a program
-    called ``a\\rUid:\\t0`` would be root's.
+    called ``a\\rUid:\\t0`` would be root's. An empty file has none.
     """
-    return content.removesuffix(b"\n").split(b"\n")
+    return content.removesuffix(b"\n").split(b"\n") if content else []
 
 
 def read_stat(folder: str) -> tuple[str, list[bytes]]:

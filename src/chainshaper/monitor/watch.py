@@ -647,13 +647,13 @@ def _values(seen: Seen) -> Iterator[tuple[str, float, dict[str, str]]]:
     for chain in seen.chains:
         named = {"chain": chain.chain}
         for span, figures in chain.spans.items():
-            statistics = {"min": figures.min_ns, "max": figures.max_ns}
-            for percentile, ns in figures.percentiles_ns.items():
-                statistics[f"p{percentile}"] = ns
-            for statistic, ns in statistics.items():
-                if ns is not None:
+            statistics: dict[str, int | None] = {"min": figures.min_ns, "max": figures.max_ns}
+            for percentile, reached_ns in figures.percentiles_ns.items():
+                statistics[f"p{percentile}"] = reached_ns
+            for statistic, figure_ns in statistics.items():
+                if figure_ns is not None:
                     about = {**named, "span": span, "statistic": statistic}
-                    yield "chain.latency", ns / SECOND, about
+                    yield "chain.latency", figure_ns / SECOND, about
         for hop in chain.hops:
             about = {**named, "node": hop.node, "topic": hop.topic}
             for part in PARTS:

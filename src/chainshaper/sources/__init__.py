@@ -1,8 +1,8 @@
-"""Where events come from: recordings of our own, the traces that others write, and tracers.
+"""Where events come from: our recordings, traces that other programs write, and tracers.
 
-:func:`open_source` is the one door: whatever it opens is a
-:class:`~chainshaper.values.recording.Recording`, so no verb and no analysis needs to know the
-difference. A :class:`Tracer` is the part of recording that differs between LTTng and eBPF.
+:func:`open_source` opens all of them as a :class:`~chainshaper.values.recording.Recording`, so no
+verb and no analysis needs to know the difference. A :class:`Tracer` is the part of recording that
+LTTng, eBPF and the library in front do differently.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,7 +17,7 @@ from chainshaper.values.recording import INFO_FILE, Recording, RecordingInfo, op
 def open_source(
     *paths: str | Path, progress: Callable[[float, str], None] | None = None
 ) -> Recording:
-    """Open a recording folder, or an LTTng trace (CTF 1.8): one folder, or several of one trace.
+    """Open a recording's folder; or an LTTng trace (CTF 1.8), which may have several folders.
 
     ``progress`` gets the share that is done, from 0 to 1, and what is being done.
     Raises InputError: there is nothing that can be read.
@@ -32,40 +32,51 @@ def open_source(
             return open_recording(folders[0])
     elif recordings:
         raise InputError(f"{recordings[0]} is a recording, which cannot be opened beside others")
-    # The decoder is slow to import: only who opens a trace pays for it.
+    # The decoder is slow to import, and is needed for traces only.
     from chainshaper.sources.lttng.trace import open_lttng_trace
 
     return open_lttng_trace(folders, progress)
 
 
 class Tracer(Protocol):
-    """A way of recording events, made for one run.
+    """A way of recording events; an object is for a single run.
 
         start() ─► the application runs; failure() is asked now and then ─► stop() ─► remove()
                                                                ─► recording() ─► written()
 
-    It gets an empty folder on the disk of the recording, which becomes its `trace/`; the
-    application's command (empty: it runs already), and the processes to attach to (empty: those
-    that the command starts; both empty: all that run).
+    Arguments of its constructor:
+
+    * an empty folder on the recording's disk, which becomes its `trace/`
+    * the command of the application; empty: the application runs already
+    * the processes to attach to; empty: those that the command starts, or, without a command, all
+      that run
     """
 
     def start(self) -> Mapping[str, str]:
-        """Begin; tracing is on when this returns. What to add to the application's environment.
+        """Begin tracing; return what to add to the application's environment.
+
+        Tracing is on when this returns.
 
         Raises PlatformError: the machine lacks the tracer or a privilege. OperationError: else.
         """
 
     def failure(self) -> str | None:
-        """Why nothing is traced any more, as half a sentence. Asked every few seconds."""
+        """Return why nothing is traced any more, as half a sentence; None: tracing goes on.
+
+        To be called every few seconds.
+        """
 
     def stop(self) -> None:
-        """End tracing; everything is on disk when this returns. Raises OperationError."""
+        """End tracing; all events are on disk when this returns. Raises OperationError."""
 
     def remove(self) -> None:
-        """Leave nothing of ours behind, however the run ended; perhaps called twice."""
+        """Remove all that `start` has set up, however the run ended. May be called twice."""
 
     def recording(self) -> tuple[EventTables, RecordingInfo]:
-        """The events, and what they tell, after `stop` and `remove`. Raises OperationError."""
+        """Return the event tables, and the recording's description.
+
+        To be called after `stop` and `remove`. Raises OperationError.
+        """
 
     def written(self) -> None:
-        """The recording is on disk: remove what says no more than its tables do."""
+        """Remove files that the tables make unnecessary: the recording is on disk now."""

@@ -14,7 +14,7 @@ from chainshaper.values import events
 from chainshaper.values.errors import InputError
 
 _LATER = ("dropped", "lost", "row", "moved")
-"""Columns that logs have since messages may wait at a gate, and since slots may move."""
+"""Columns that older logs do not have: since then messages may wait at a gate, and slots move."""
 _TYPES = events.column_types("gate_release")
 
 
@@ -31,7 +31,7 @@ def read_gate_log(path: str | Path) -> pl.DataFrame:
 
 
 def _parts(path: Path) -> list[Path]:
-    """Return the files of a log that are there; an empty one is none: the disk had no room."""
+    """Return the existing files of a log, without empty ones, which a full disk leaves."""
     before = path.with_name(f"{path.name}.1")
     return [file for file in (before, path) if file.is_file() and file.stat().st_size]
 

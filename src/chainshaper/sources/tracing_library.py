@@ -33,7 +33,7 @@ class TracingLibrary:
 
     @property
     def major(self) -> int:
-        """The first number of the version: where it is not known, one of today's."""
+        """The first number of the version; if it is not known, that of a present version."""
         return 8 if self.version is None else int(self.version.partition(".")[0])
 
     @property

@@ -43,9 +43,9 @@ def value(chance: random.Random, kind: str) -> Any:
 
 
 def fields(chance: random.Random, kinds: dict[str, str]) -> dict[str, Any]:
-    found = {name: value(chance, kind) for name, kind in kinds.items()}
-    lengths = {f"_{name}_length": len(found[name]) for name, k in kinds.items() if k[-2:] == "[]"}
-    return found | lengths
+    values = {name: value(chance, kind) for name, kind in kinds.items()}
+    lengths = {f"_{name}_length": len(values[name]) for name, k in kinds.items() if k[-2:] == "[]"}
+    return values | lengths
 
 
 def records(
@@ -59,8 +59,8 @@ def records(
     chance, time, made = random.Random(seed), start, []
     for _ in range(count):
         time += chance.choice([0, 1, 1000, 60_000_000, 12_000_000_000])
-        name, own = chance.choice(list(events)), fields(chance, context)
-        made.append(EventRecord(name, time, fields(chance, events[name]), own))
+        name, contexts = chance.choice(list(events)), fields(chance, context)
+        made.append(EventRecord(name, time, fields(chance, events[name]), contexts))
     return made
 
 

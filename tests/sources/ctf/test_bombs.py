@@ -125,8 +125,8 @@ def test_a_few_bytes_take_little_memory_and_time(tmp_path: Path) -> None:
         capture_output=True, text=True, check=False, timeout=160,
     )  # fmt: skip
     assert run.returncode == 0, run.stderr[-2000:]
-    *found, headers, damaged_packets = map(json.loads, run.stdout.splitlines())
-    for (name, (*_, reason)), (memory, rows, said) in zip(BOMBS.items(), found, strict=True):
+    *of_bombs, headers, damaged_packets = map(json.loads, run.stdout.splitlines())
+    for (name, (*_, reason)), (memory, rows, said) in zip(BOMBS.items(), of_bombs, strict=True):
         assert memory < MOST_MEMORY, name
         assert (rows > 0, said) == (True, []) if reason is None else reason in said[0], name
     assert headers[1] == 0

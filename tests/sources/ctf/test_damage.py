@@ -182,17 +182,19 @@ def test_metadata_may_be_another_runs(tmp_path: Path) -> None:
     metadata = (again / STREAM).with_name("metadata")
     (whole / STREAM).with_name("metadata").write_bytes(b"")
     said = refused(2, "info", whole)
-    own = said.partition("write the UUID of this trace, ")[2].partition(",")[0]
-    replaced = metadata.read_bytes().replace(b"00000000-0000-0000-0000-000000000007", own.encode())
+    uuid = said.partition("write the UUID of this trace, ")[2].partition(",")[0]
+    replaced = metadata.read_bytes().replace(b"00000000-0000-0000-0000-000000000007", uuid.encode())
     (whole / STREAM).with_name("metadata").write_bytes(replaced)
     assert json_of("latency", whole, "--chain", "/image../objects")["count"] == 20
 
 
-@pytest.mark.parametrize(("name", "what"), [("empty", "is empty"), ("half", "ends in the middle")])
-def test_public_metadata_that_is_not_whole(name: str, what: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "reason"), [("empty", "is empty"), ("half", "ends in the middle")]
+)
+def test_public_metadata_that_is_not_whole(name: str, reason: str) -> None:
     for verb in ("info", "callbacks"):
         said = refused(2, verb, field_trace("metadata_not_whole") / name)
-        assert what in said
+        assert reason in said
         assert all(text in said for text in REMEDIES)
 
 

@@ -151,8 +151,8 @@ def damaged(
 def test_each_damage_names_its_byte(
     tmp_path: Path, place: Any, data: Any, times: Any, byte: Any, reason: Any
 ) -> None:
-    found, warnings = damaged(tmp_path, place, data)
-    assert found == times
+    read_times, warnings = damaged(tmp_path, place, data)
+    assert read_times == times
     assert len(warnings) == 1
     assert f"{tmp_path / 'stream'}, byte {byte}: " in warnings[0]
     assert reason in warnings[0]

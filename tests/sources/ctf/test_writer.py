@@ -33,8 +33,8 @@ def test_round_trip(tmp_path: Path, options: dict[str, Any]) -> None:
     frames = read_events(open_trace(tmp_path))
     rows = actual_rows({n: f.drop("cpu", "procname") for n, f in frames.items()})
     assert rows.keys() == expected.keys()
-    for name, found in expected.items():
-        assert sorted(map(repr, rows[name])) == sorted(map(repr, found))
+    for name, expected_rows in expected.items():
+        assert sorted(map(repr, rows[name])) == sorted(map(repr, expected_rows))
     assert_equal_to_babeltrace(tmp_path)
 
 
@@ -62,14 +62,16 @@ def test_kernel_beside_user_space_and_per_process_folders(tmp_path: Path) -> Non
     alone = read_events(open_trace(tmp_path / "ust/pid/first-1-20260101"))
     for name, frame in alone.items():
         assert set(frame["time"]) <= set(frames[name]["time"])
-    other = lttng_metadata({"ros2:callback_end": {"other": "u32"}})
-    write_packet(tmp_path / "other", other, [EventRecord("ros2:callback_end", START, {"other": 1})])
+    metadata = lttng_metadata({"ros2:callback_end": {"other": "u32"}})
+    write_packet(
+        tmp_path / "other", metadata, [EventRecord("ros2:callback_end", START, {"other": 1})]
+    )
     both = read_events(open_trace(tmp_path))["ros2:callback_end"]
     assert both["other"][0] == 1, "events of one name and other fields are in one frame"
     assert both["callback"][1:].to_list() == frames["ros2:callback_end"]["callback"].to_list()
     # Naming a folder twice does not read it twice.
     twice = open_trace(tmp_path, tmp_path / "kernel")
-    packets = [sum(len(one.packets) for one in found.streams) for found in (twice, trace)]
+    packets = [sum(len(stream.packets) for stream in opened.streams) for opened in (twice, trace)]
     assert packets[0] == packets[1] + 1
 
 
@@ -91,8 +93,8 @@ def test_losses_are_counted(tmp_path: Path, files: Any) -> None:
     # babeltrace2 does not count what was lost before a stream's first packet; counters wrap.
     lost = [(1 << 32) - 2, 3]
     first = [
-        encode_packet(declared, records(1, 1), {"packet_seq_num": n, "events_discarded": one})
-        for n, one in enumerate(lost)
+        encode_packet(declared, records(1, 1), {"packet_seq_num": n, "events_discarded": discarded})
+        for n, discarded in enumerate(lost)
     ]
     write_trace(tmp_path / "first", text, {"a": first})
     assert open_trace(tmp_path / "first").discarded_events == (1 << 32) + 3
@@ -106,7 +108,7 @@ def test_many_spans_and_threads_give_the_same_frames(
     make_trace(tmp_path, streams=4, packets=10, events=60)
     trace = open_trace(tmp_path)
     whole = read_events(trace)
-    monkeypatch.setattr(decode, "_SMALL_BYTES", 0)
+    monkeypatch.setattr(decode, "_SMALLEST_CHUNK_BYTES", 0)
     monkeypatch.setattr(decode, "_CHUNK_BYTES", 4096)
     for threads in (1, 3):
         cut = read_events(trace, threads=threads)
@@ -142,14 +144,14 @@ def test_every_event_is_where_a_sort_by_time_and_file_puts_it(
     encoded = {}
     declared = parse_tsdl(lttng_metadata(EVENTS, {}))
     for file in range(streams):
-        time, found = 1 << 40, []
+        time, events_of_file = 1 << 40, []
         for _ in range(chance.choice([0, 1, BATCH, BATCH + 1, 5 * BATCH])):
             time += chance.choice([0, 0, 1, 3])
             name = chance.choice(["ros2:number"] * 30 + ["ros2:text"])
             payload = {"place": len(made)} | ({"text": "x"} if name == "ros2:text" else {})
             made.append((time, file, len(made), name))
-            found.append(EventRecord(name, time, payload, {}))
-        sizes = [found[n : n + 100] for n in range(0, len(found), 100)]
+            events_of_file.append(EventRecord(name, time, payload, {}))
+        sizes = [events_of_file[n : n + 100] for n in range(0, len(events_of_file), 100)]
         encoded[f"channel_{file:02}"] = [
             encode_packet(declared, part, {"cpu_id": file, "packet_seq_num": n}, instance=file)
             for n, part in enumerate(sizes)

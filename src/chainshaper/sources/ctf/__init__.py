@@ -5,7 +5,8 @@
     read_events(trace, {"ros2:callback_start"})["ros2:callback_start"]
 
 From a folder to frames: `tsdl` reads the metadata, `layout` hands its types to the decoder in C++
-(core/ctf), `trace` has it find packets, and `read` has it write columns.
+(core/ctf), `trace` lets the decoder find the packets, `copies` leaves out packets that are there
+twice, and `read` lets the decoder write the columns.
 """
 
 from chainshaper.sources.ctf.read import Events, count_events, read_events

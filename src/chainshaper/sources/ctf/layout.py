@@ -1,7 +1,7 @@
-"""From a trace's metadata to what the decoder in C++ is given (core/ctf).
+"""Tell the decoder in C++ (core/ctf) what a trace's metadata declares, and what is wanted of it.
 
-`describe` hands over the types of a trace; `select` says which of its events are wanted, and which
-of their fields get columns. How the bits of all that lie is the decoder's own business.
+`describe` converts the types of a trace; `select` chooses events, and which of their fields get
+columns. The decoder works out where each field's bits are (`lay_out`).
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ MAGIC = _core.CTF_MAGIC
 """The number that each packet begins with."""
 _BILLION = 1_000_000_000
 _DEEPEST = 12
+"""Types inside types that are converted at most: hostile metadata must not exhaust the stack."""
 _STREAM_CONTEXT, _EVENT_CONTEXT, _FIELDS = (
     _core.CtfScope.STREAM_EVENT_CONTEXT,
     _core.CtfScope.EVENT_CONTEXT,
@@ -35,7 +36,7 @@ class LayoutError(ValueError):
 
 
 def describe(trace: tsdl.TraceClass) -> _core.CtfTraceClass:
-    """What a trace's metadata declares, for the decoder. Raises `CtfError`."""
+    """Convert what a trace's metadata declares for the decoder. Raises `CtfError`."""
     types = _Types(trace.byte_order == "be")
     try:
         return _core.CtfTraceClass(
@@ -72,12 +73,15 @@ def lay_out(
     described: Sequence[_core.CtfTraceClass],
     wanted: Sequence[_core.CtfWantedEvent] = (),
 ) -> _core.CtfLayout:
-    """Lay out all streams and events. Raises `CtfError` for types that cannot be read."""
+    """Let the decoder lay out all streams and events.
+
+    Raises `CtfError`: types that cannot be read.
+    """
     try:
         return _core.CtfLayout(described, wanted)
     except ValueError as error:
-        reason, number = error.args
-        raise _cannot_be_read(traces[number], reason) from None
+        reason, trace_number = error.args
+        raise _cannot_be_read(traces[trace_number], reason) from None
 
 
 def _cannot_be_read(trace: tsdl.TraceClass, reason: str) -> tsdl.CtfError:
@@ -89,6 +93,7 @@ def _of_kernel(trace: tsdl.TraceClass) -> bool:
 
 
 def _uuid(trace: tsdl.TraceClass) -> tuple[int, int] | None:
+    """Return the trace's UUID as two numbers of 64 bits, as they lie in a packet's header."""
     if trace.uuid is None:
         return None
     try:
@@ -99,25 +104,30 @@ def _uuid(trace: tsdl.TraceClass) -> tuple[int, int] | None:
 
 
 class _Types:
-    """Types of a trace for the decoder; one that is declared once is handed over once."""
+    """Converts the types of a trace for the decoder.
+
+    A type that many fields share is one object in the metadata, and is converted once.
+    """
 
     def __init__(self, big_endian: bool) -> None:
         self._big_endian = big_endian
-        self._known: dict[int, _core.CtfType] = {}
+        self._converted: dict[
+            int, _core.CtfType
+        ] = {}  # by the identity of the type in the metadata
 
     def scope(self, structure: tsdl.StructType | None) -> _core.CtfType | None:
-        """A structure at the top: a header, a context, an event's fields."""
+        """Convert the structure of a scope: a header, a context, or an event's fields."""
         return None if structure is None else self._type("", structure, 0)
 
     def _type(self, name: str, kind: tsdl.Type, depth: int) -> _core.CtfType:
         if depth > _DEEPEST:
             raise LayoutError(f"{name}: types nested too deeply")
-        known = self._known.get(id(kind))
-        if known is None:
-            known = self._known[id(kind)] = self._made(name, kind, depth + 1)
-        return known
+        converted = self._converted.get(id(kind))
+        if converted is None:
+            converted = self._converted[id(kind)] = self._convert(name, kind, depth + 1)
+        return converted
 
-    def _made(self, name: str, kind: tsdl.Type, depth: int) -> _core.CtfType:
+    def _convert(self, name: str, kind: tsdl.Type, depth: int) -> _core.CtfType:
         match kind:
             case tsdl.IntegerType():
                 return self._integer(kind)
@@ -138,7 +148,8 @@ class _Types:
 
     def _integer(self, kind: tsdl.IntegerType) -> _core.CtfType:
         big = self._big_endian if kind.byte_order == "native" else kind.byte_order == "be"
-        # Values of 64 bits, counted from the least one.
+        # The decoder gets ranges of labels as distances from the least value of 64 bits, so that
+        # signed and unsigned values need one type only.
         least, most = -(1 << 63) if kind.signed else 0, (1 << 64) - 1
         return _core.CtfType.integer(
             size=kind.size,
@@ -155,6 +166,7 @@ class _Types:
 
 
 def _clock_names(kind: tsdl.Type | None) -> Iterator[str]:
+    """Yield the names of the clocks that integers of a type are mapped to."""
     match kind:
         case tsdl.IntegerType(clock=str(name)):
             yield name
@@ -164,7 +176,7 @@ def _clock_names(kind: tsdl.Type | None) -> Iterator[str]:
 
 
 def _frequency(stream: tsdl.StreamClass, trace: tsdl.TraceClass) -> int:
-    """The rate of the clock that a stream's time stamps are mapped to, in Hz."""
+    """Return the rate in Hz of the clock that a stream's time stamps are mapped to."""
     names = [*_clock_names(stream.event_header), *_clock_names(stream.packet_context)]
     for name in names:
         if name not in trace.clocks:
@@ -177,14 +189,17 @@ def _frequency(stream: tsdl.StreamClass, trace: tsdl.TraceClass) -> int:
 
 
 class Table(NamedTuple):
-    """Where the events of one name and one shape go: ``time``, ``cpu`` where known, ``columns``."""
+    """A table for events of one name whose fields have the same names and types.
 
-    name: str
-    columns: tuple[tuple[str, tsdl.Type], ...]
+    It has the column ``time``, ``cpu`` where that is known, and those of ``columns``.
+    """
+
+    name: str  # of the events
+    columns: tuple[tuple[str, tsdl.Type], ...]  # name and type of each
     has_cpu: bool
 
     def column_types(self) -> list[np.dtype[Any]]:
-        """What each column has: integers, or codes of texts."""
+        """Return the types of the columns' arrays: integers as declared, or codes of texts."""
         return [
             np.dtype(f"{'i' if kind.signed else 'u'}{1 << ((kind.size + 7 >> 3) - 1).bit_length()}")
             if isinstance(kind, tsdl.IntegerType)
@@ -194,39 +209,40 @@ class Table(NamedTuple):
 
 
 class Selection(NamedTuple):
-    """The events that are wanted, the stream classes that have any, and the tables they go to.
+    """The events that are wanted, and where they go.
 
-    Events and stream classes are counted over all traces, in order of declaration.
+    Events and stream classes are numbered over all traces, in order of declaration.
     """
 
     events: list[_core.CtfWantedEvent]
-    stream_classes: set[int]
+    stream_classes: set[int]  # that have wanted events
     tables: list[Table]
 
 
 def select(traces: Sequence[tsdl.TraceClass], wanted: Mapping[str, bool]) -> Selection:
     """Choose the events that are ``wanted``, and their columns.
 
-    All get pid and tid, and the procname where that is true.
+    ``wanted`` maps the name of an event to whether it gets a column ``procname``; all get pid and
+    tid.
     """
-    tables: dict[Table, int] = {}
-    found = Selection([], set(), [])
-    number = -1
+    table_numbers: dict[Table, int] = {}
+    events: list[_core.CtfWantedEvent] = []
+    stream_classes: set[int] = set()
+    event_number = -1
     streams = [(trace, stream) for trace in traces for stream in trace.streams.values()]
-    for row, (trace, stream) in enumerate(streams):
+    for stream_class, (trace, stream) in enumerate(streams):
         for event in stream.events.values():
-            number += 1
+            event_number += 1
             if event.name not in wanted:
                 continue
             places, columns = _columns(stream, event, _of_kernel(trace), wanted[event.name])
             table = Table(event.name, columns, _says_cpu(trace, stream))
-            found.events.append(
-                _core.CtfWantedEvent(
-                    event=number, table=tables.setdefault(table, len(tables)), columns=places
-                )
+            table_number = table_numbers.setdefault(table, len(table_numbers))
+            events.append(
+                _core.CtfWantedEvent(event=event_number, table=table_number, columns=places)
             )
-            found.stream_classes.add(row)
-    return found._replace(tables=list(tables))
+            stream_classes.add(stream_class)
+    return Selection(events, stream_classes, list(table_numbers))
 
 
 def _says_cpu(trace: tsdl.TraceClass, stream: tsdl.StreamClass) -> bool:
@@ -242,15 +258,16 @@ def _says_cpu(trace: tsdl.TraceClass, stream: tsdl.StreamClass) -> bool:
 _Place = tuple[_core.CtfScope, int]
 """A scope and the number of a field in it."""
 _Columns = tuple[list[_Place], tuple[tuple[str, tsdl.Type], ...]]
+"""The places of the fields that get columns, and the name and type of each column."""
 
 
 def _columns(
     stream: tsdl.StreamClass, event: tsdl.EventClass, kernel: bool, procname: bool
 ) -> _Columns:
-    """The fields of an event that get columns, and these columns, in the order in which they lie.
+    """Choose the fields of an event that get columns, in the order in which they are recorded.
 
-    A kernel trace's pid and tid are of the initial namespace; user space traces have ``vpid`` and
-    ``vtid`` of the process's only.
+    A ``kernel`` trace has ``pid`` and ``tid`` of the initial namespace; traces of user space have
+    only ``vpid`` and ``vtid``, of the process's namespace.
     """
     scopes = {_STREAM_CONTEXT: stream.event_context, _EVENT_CONTEXT: event.context}
     scopes[_FIELDS] = event.fields
@@ -261,12 +278,14 @@ def _columns(
         if _has_column(member.type)
     }
     contexts = [place for place in members if place[0] != _FIELDS]
-    present = {tsdl.field_name(members[place].name): place for place in reversed(contexts)}
-    named: dict[_Place, str] = {}
+    # Reversed, so that of two fields of one name the one of the outer scope stays.
+    place_of = {tsdl.field_name(members[place].name): place for place in reversed(contexts)}
+    column_names: dict[_Place, str] = {}
     for column in ("pid", "tid", "procname") if procname else ("pid", "tid"):
         names = (column, f"v{column}") if kernel else (f"v{column}", column)
-        if found := next((present[name] for name in names if name in present), None):
-            named[found] = column
+        recorded = [name for name in names if name in place_of]
+        if recorded:
+            column_names[place_of[recorded[0]]] = column
     taken = {"time", "cpu", "pid", "tid", "procname"}
     for place, member in members.items():
         if place[0] == _FIELDS:
@@ -274,12 +293,13 @@ def _columns(
             while name in taken:
                 name = f"payload.{name}"
             taken.add(name)
-            named[place] = name
-    places = [place for place in members if place in named]
-    return places, tuple((named[place], members[place].type) for place in places)
+            column_names[place] = name
+    places = [place for place in members if place in column_names]
+    return places, tuple((column_names[place], members[place].type) for place in places)
 
 
 def _has_column(kind: tsdl.Type) -> bool:
+    """Whether fields of this type become columns: integers, texts, arrays of bytes."""
     match kind:
         case tsdl.IntegerType() | tsdl.StringType() | tsdl.ArrayType(tsdl.IntegerType(8, 8)):
             return True

@@ -1,14 +1,16 @@
-"""Counting events and reading them into data frames.
+"""Count events, and read them into data frames.
 
-Pass 1 (`_File.count`) steps over every event of a file and counts, so that each has its row. Pass 2
-(`_filled`) writes the wanted events of a chunk of a file to their rows, and these are sorted. Both
-are C++ (core/ctf), and run on several threads; of a large trace only some chunks are in memory at
-once.
+Pass 1 (`_File.count`) steps over every event of a file and counts, so that the row of each event is
+known. Pass 2 (`_filled`) writes the wanted events, chunk by chunk of the files, to their rows; then
+each table is sorted by time. Both passes are C++ (core/ctf), and run on several threads. Of a large
+trace only some chunks are in memory at once.
 """
 
+import mmap
 import os
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +25,17 @@ from chainshaper.sources.ctf.layout import Table, lay_out, select
 from chainshaper.sources.ctf.trace import CtfTrace, MappedFile
 from chainshaper.values.progress import ShareDone
 
-_CHUNK_BYTES = 32 << 20
-_SMALL_BYTES = 4 << 20
+_CHUNK_BYTES, _SMALLEST_CHUNK_BYTES = 32 << 20, 4 << 20
 _LARGE_BYTES = 512 << 20
+"""A trace of more bytes is not left in memory between the two passes."""
 _HUGE_PAGE = 2 << 20
+_LARGE_COLUMN = 4 * _HUGE_PAGE
+_PAGE = 4096
+_APART = 320
+"""Columns side by side must not begin alike in their pages, or they would compete for the same few
+lines of the processor's cache: each begins so many bytes further than the one before it."""
 _MOST_WARNINGS = 20
+"""Damaged packets that are named, of each file; of more only the number is."""
 _FAILURES = {
     _core.CtfFailure.OTHER_TIME: "an event outside the time that its packet says it was open",
     _core.CtfFailure.NO_PROCESS: "an event of process or thread 0: there are zeros instead of what"
@@ -45,25 +53,22 @@ _FAILURES = {
 
 
 class Events(dict[str, pl.DataFrame]):
-    """Frames by event name; ``warnings`` say what cannot be read, of so many packets ``damaged``.
+    """Frames by event name."""
 
-    ``counts`` are of all events in the streams that were read, zeros included.
-    """
-
-    warnings: tuple[str, ...] = ()
-    damaged: int = 0
-    counts: dict[str, int]
+    warnings: tuple[str, ...] = ()  # what cannot be read
+    damaged: int = 0  # packets with events that cannot be read
+    counts: dict[str, int]  # of all events in the streams that were read, zeros included
 
 
 def count_events(
     trace: CtfTrace, threads: int | None = None
 ) -> tuple[dict[str, int], tuple[str, ...]]:
-    """Events per name, zeros included, ordered by name, and what cannot be read.
+    """Count events per name, ordered by name, zeros included; and say what cannot be read.
 
     Raises `CtfError` where a file is gone.
     """
-    found = read_events(trace, (), threads=threads, counted=True)
-    return found.counts, found.warnings
+    events = read_events(trace, (), threads=threads, counted=True)
+    return events.counts, events.warnings
 
 
 def read_events(
@@ -81,22 +86,24 @@ def read_events(
     rows where it never happened. Rows are sorted by ``time``; equal times stand in the order
     of the stream files, and in one file as recorded. Columns:
 
-    * ``time``: Int64, ns on the trace's own clock (CLOCK_MONOTONIC for LTTng), its offset not
-      added; ``cpu``: Int32; ``pid``, ``tid``: integers as recorded; null where the trace has none.
-    * ``procname``: Categorical, where recorded; not for the events that are ``nameless``, since
-      reading it is most of the work for an event without other texts.
-    * the payload under its own names without LTTng's leading underscore; a field called like
-      one of the above is ``payload.<name>``. Integers keep their width and sign, enumerations
+    * ``time``: Int64, ns of the trace's clock (CLOCK_MONOTONIC for LTTng), its offset not added
+    * ``cpu``: Int32, the core; null where the trace does not say it
+    * ``pid``, ``tid``: integers as recorded; null where the trace has none
+    * ``procname``: Categorical, where recorded; not for the events in ``nameless``, since reading
+      it is most of the work for an event without other texts
+    * the fields of the event, under their names without LTTng's leading underscore; a field called
+      like one of the above is ``payload.<name>``. Integers keep their width and sign, enumerations
       their integer; strings and text arrays are String (bytes that are not UTF-8 as ``\\xNN``),
-      arrays and sequences of bytes List of UInt8. Fields of other kinds are passed over.
+      arrays and sequences of bytes List of UInt8. Fields of other types are passed over.
 
-    Events that cannot be read end their packet; the result's ``warnings`` say which and why. All
-    are to be ``counted``, or those of streams without ``names`` need not be. ``progress`` gets the
-    share that is done, from 0 to 1.
+    An event that cannot be read ends its packet; the result's ``warnings`` say which and why.
+    With ``counted``, ``counts`` are of all streams; else streams that cannot have an event of
+    ``names`` are not read, and their events count as none. ``progress`` gets the share that is
+    done, from 0 to 1.
     Raises `CtfError` where a file is gone or changes while it is read.
     """
-    asked = trace.event_names if names is None else names
-    wanted = select(trace.folders, {name: name not in nameless for name in asked})
+    read = trace.event_names if names is None else names
+    wanted = select(trace.folders, {name: name not in nameless for name in read})
     layout = lay_out(trace.folders, trace.described, wanted.events)
     used = [
         stream
@@ -106,11 +113,11 @@ def read_events(
     files = [_File(stream, layout) for stream in used]
     workers = threads or len(os.sched_getaffinity(0))
     size = sum(file.map.size for file in files)
-    chunk = min(_CHUNK_BYTES, max(_SMALL_BYTES, size // workers))
+    chunk = min(_CHUNK_BYTES, max(_SMALLEST_CHUNK_BYTES, size // workers))
     with ThreadPoolExecutor(workers) as pool:
-        # Read twice, a trace that fits into memory had better stay there in between.
-        walks = pool.map(lambda file: file.count(chunk, size > _LARGE_BYTES), files)
-        for done, _ in enumerate(walks, 1):
+        # Files are read twice: a trace that fits into memory had better stay there in between.
+        counted_files = pool.map(lambda file: file.count(chunk, size > _LARGE_BYTES), files)
+        for done, _ in enumerate(counted_files, 1):
             progress(done / len(files) / 3)
         rows = [np.zeros(len(wanted.tables), np.int64), *(file.rows for file in files)]
         first_rows = np.cumsum(rows, axis=0)
@@ -119,8 +126,9 @@ def read_events(
             for number, table in enumerate(wanted.tables)
         ]
         texts = _filled(pool, files, first_rows, columns, progress)
+        parts = _parts(pool, columns, texts)
     try:
-        events = Events(_frames(columns, texts))
+        events = Events(_frames(parts))
     except pl.exceptions.PolarsError as error:
         reason = f"events of one name have fields of types that do not fit together: {error}"
         folder = trace.folders[0].path
@@ -140,7 +148,11 @@ def read_events(
 
 
 class _File:
-    """A stream file that is being read, in ``chunks``; ``rows`` of each table are in it."""
+    """A stream file that is being read.
+
+    ``chunks`` are the parts in which it is read; ``rows`` says how many rows of each table it
+    gives. Both are known after :meth:`count`.
+    """
 
     def __init__(self, stream: CtfStream, layout: _core.CtfLayout) -> None:
         self.path, self.packets = stream.path, stream.packets
@@ -149,13 +161,16 @@ class _File:
         columns = {name: self.packets[name].to_numpy() for name in names}
         try:
             self.reader = _core.CtfEventReader(layout, self.map.bytes, **columns)
-        except ValueError:  # a packet is not in the file
+        except ValueError:  # a packet reaches over the file's end
             raise _changed(self.path) from None
         self.rows: NDArray[np.int64] = np.zeros(0, np.int64)
         self.chunks: list[_core.CtfChunk] = []
 
     def count(self, chunk_bytes: int, lean: bool) -> None:
-        """Step over all events, and shorten packets to what can be read; ``lean`` on memory."""
+        """Count all events, and shorten packets to what can be read of them.
+
+        ``lean``: let go of the file's pages after each chunk.
+        """
         offsets = self.packets["offset"].to_numpy()
         first = 0
         while first < len(offsets):
@@ -169,7 +184,7 @@ class _File:
     def write(
         self, chunk: _core.CtfChunk, tables: list[_core.CtfTable], first_rows: NDArray[np.int64]
     ) -> list[bytes]:
-        """Write a chunk's events to their tables; the texts that text columns have codes of."""
+        """Write a chunk's events to their tables; return the texts, in the order of their codes."""
         try:
             texts = self.reader.write(chunk, tables, first_rows)
         except _core.CtfFileChangedError:
@@ -184,7 +199,7 @@ def _changed(path: Path) -> tsdl.CtfError:
 
 
 def _warnings(files: Sequence[_File]) -> Iterator[str]:
-    """What cannot be read, packet by packet, the first ones of very many."""
+    """Say what cannot be read, packet by packet, up to :data:`_MOST_WARNINGS` of each file."""
     for file in files:
         bad_events = file.reader.bad_events
         for event in bad_events[:_MOST_WARNINGS]:
@@ -208,9 +223,10 @@ def _filled(
     columns: list["_Columns"],
     progress: ShareDone,
 ) -> list[bytes]:
-    """Pass 2 over all chunks; returns the texts and bytes that text columns then have codes of.
+    """Write the events of all chunks to the tables (pass 2).
 
-    ``first_rows`` are the tables' rows at which those of each file begin.
+    ``first_rows``: for each file and each table, the row at which the file's events begin.
+    Returns the texts, and arrays of bytes, in the order of their codes in text columns.
     """
     tables = [table.arrays() for table in columns]
     chunks = [
@@ -222,14 +238,15 @@ def _filled(
     codes: dict[bytes, int] = {}
     written = pool.map(lambda part: part[0].write(part[2], tables, part[1]), chunks)
     for done, ((_, first, chunk), texts) in enumerate(zip(chunks, written, strict=True), 1):
-        others = [codes.setdefault(text, len(codes)) for text in texts]
-        if others != list(range(len(others))):
+        # Each chunk has codes of its own, from 0; these are the codes in the whole trace.
+        common_codes = [codes.setdefault(text, len(codes)) for text in texts]
+        if common_codes != list(range(len(common_codes))):
             for table in columns:
                 before, after = first + chunk.rows_before, first + chunk.rows_after
                 rows = slice(before[table.number], after[table.number])
-                table.recode(rows, np.array(others, np.uint32))
+                table.recode(rows, np.array(common_codes, np.uint32))
         progress((1 + 2 * done / len(chunks)) / 3)
-    # Rows stand file by file, each in order of time but for clocks that went back.
+    # So far rows stand file by file, each in order of time unless a clock went back.
     list(pool.map(_core.CtfTable.sort_by_time, tables))
     return list(codes)
 
@@ -240,8 +257,9 @@ def _filled(
 class _Columns:
     """The arrays of one table of so many ``rows``: time, cpu (or nothing) and its columns' values.
 
-    They are parts of one piece of memory, large enough for huge pages: page faults would else be a
-    third of all work.
+    Large ones have memory of their own, so that a frame that is made of some of them keeps no
+    others. The small ones of a table are parts of one piece of memory, large enough for huge pages:
+    page faults would else be a third of all work.
     """
 
     def __init__(self, number: int, table: Table, rows: int) -> None:
@@ -249,14 +267,16 @@ class _Columns:
         wanted: list[tuple[int, np.dtype[Any]]] = [(rows, np.dtype("i8"))]
         wanted += [(rows * table.has_cpu, np.dtype("i4"))]
         wanted += [(rows, kind) for kind in table.column_types()]
-        # Columns side by side must not begin alike in their pages, or they would compete for
-        # the same few lines of the processor's cache.
-        sizes = [-(-count * kind.itemsize // 4096) * 4096 + 320 for count, kind in wanted]
-        parts = np.split(_memory(sum(sizes)), np.cumsum(sizes))
-        self.time, self.cpu, *self.values = (
-            part[: count * kind.itemsize].view(kind)
-            for part, (count, kind) in zip(parts, wanted, strict=False)
-        )
+        sizes = [-(-count * kind.itemsize // _PAGE) * _PAGE + _APART for count, kind in wanted]
+        shared = _memory(sum(size for size in sizes if size < _LARGE_COLUMN))
+        arrays = []
+        for place, (size, (count, kind)) in enumerate(zip(sizes, wanted, strict=True)):
+            if size < _LARGE_COLUMN:
+                memory, shared = shared[:size], shared[size:]
+            else:
+                memory = _returned_memory(place * _APART + size)[place * _APART :]
+            arrays.append(memory[: count * kind.itemsize].view(kind))
+        self.time, self.cpu, *self.values = arrays
 
     def arrays(self) -> _core.CtfTable:
         """The arrays for the decoder to write to."""
@@ -264,35 +284,38 @@ class _Columns:
         return _core.CtfTable(times_ns=self.time, cpus=cpus, columns=self.values)
 
     def recode(self, rows: slice, codes: NDArray[np.uint32]) -> None:
-        """Replace one chunk's own codes of texts by those of the whole."""
+        """Replace a chunk's codes of texts by those in the whole trace: ``codes[old]`` is new."""
         for (_, kind), array in zip(self.table.columns, self.values, strict=True):
             if not isinstance(kind, tsdl.IntegerType):
                 _core.recode(array[rows], codes)
 
-    def frame(self, known: list[bytes], strings: pl.Series, categories: pl.Series) -> pl.DataFrame:
-        """The table's frame; codes are of what is ``known``, which are ``strings`` as texts."""
-        found = {"time": pl.Series("time", self.time)}
+    def frame(self, texts: list[bytes], strings: pl.Series, categories: pl.Series) -> pl.DataFrame:
+        """Make the table's frame.
+
+        Codes are positions in ``texts``, which are also given as ``strings`` and ``categories``.
+        """
+        columns = {"time": pl.Series("time", self.time)}
         if self.table.has_cpu:
-            found["cpu"] = pl.Series("cpu", self.cpu)
-        for (name, kind), column in zip(self.table.columns, self.values, strict=True):
+            columns["cpu"] = pl.Series("cpu", self.cpu)
+        for (name, kind), values in zip(self.table.columns, self.values, strict=True):
             if tsdl.is_text(kind):
-                texts = categories if name == "procname" else strings
-                found[name] = texts.gather(pl.Series(column)).alias(name)
+                shown = categories if name == "procname" else strings
+                columns[name] = shown.gather(pl.Series(values)).alias(name)
             elif isinstance(kind, tsdl.ArrayType):
-                codes, places = np.unique(column, return_inverse=True)
-                lists = [list(known[code]) for code in codes]
-                found[name] = pl.Series(name, lists, pl.List(pl.UInt8)).gather(places)
+                codes, places = np.unique(values, return_inverse=True)
+                lists = [list(texts[code]) for code in codes]
+                columns[name] = pl.Series(name, lists, pl.List(pl.UInt8)).gather(places)
             else:
-                found[name] = pl.Series(name, column)
+                columns[name] = pl.Series(name, values)
         for name in ("cpu", "pid", "tid"):
-            if name not in found:
-                found[name] = pl.Series(name, [None], pl.Int32).new_from_index(0, self.rows)
-        leading = [n for n in ("time", "cpu", "pid", "tid", "procname") if n in found]
-        return pl.DataFrame([found[n] for n in dict.fromkeys([*leading, *found])])
+            if name not in columns:
+                columns[name] = pl.Series(name, [None], pl.Int32).new_from_index(0, self.rows)
+        leading = [n for n in ("time", "cpu", "pid", "tid", "procname") if n in columns]
+        return pl.DataFrame([columns[n] for n in dict.fromkeys([*leading, *columns])])
 
 
 def _memory(size: int) -> NDArray[np.uint8]:
-    """Bytes of any content; many of them fill huge pages, which NumPy asks for, from end to end."""
+    """Return bytes of any content; many of them begin at a huge page, which NumPy asks for."""
     if size < 2 * _HUGE_PAGE:
         return np.empty(size, np.uint8)
     memory = np.empty((size // _HUGE_PAGE + 2) * _HUGE_PAGE, np.uint8)
@@ -300,15 +323,33 @@ def _memory(size: int) -> NDArray[np.uint8]:
     return memory[first : first + size]
 
 
-def _frames(columns: list[_Columns], known: list[bytes]) -> dict[str, pl.DataFrame]:
+def _returned_memory(size: int) -> NDArray[np.uint8]:
+    """Zeros in huge pages, which the system gets back with the last array that has a part of them.
+
+    NumPy's memory is `malloc`'s, which keeps what it has once let go.
+    """
+    memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    with suppress(OSError):  # a kernel without huge pages
+        memory.madvise(mmap.MADV_HUGEPAGE)
+    return np.frombuffer(memory, np.uint8)
+
+
+def _parts(
+    pool: ThreadPoolExecutor, columns: list[_Columns], known: list[bytes]
+) -> dict[str, list[pl.DataFrame]]:
+    """Event → the frames of its tables; codes of texts are of what is ``known``."""
     texts = [text.decode(errors="backslashreplace") for text in known]
     strings = pl.Series("", texts or [""], dtype=pl.String)
     categories = strings.cast(pl.Categorical)
     parts: dict[str, list[pl.DataFrame]] = {}
-    while columns:
-        # Arrays are let go one table at a time: Polars has copies of its own.
-        table = columns.pop(0)
-        parts.setdefault(table.table.name, []).append(table.frame(known, strings, categories))
+    frames = pool.map(lambda table: table.frame(known, strings, categories), columns)
+    for table, frame in zip(columns, frames, strict=True):
+        parts.setdefault(table.table.name, []).append(frame)
+    return parts
+
+
+def _frames(parts: dict[str, list[pl.DataFrame]]) -> dict[str, pl.DataFrame]:
+    """One frame for each event, ordered by name."""
     frames: dict[str, pl.DataFrame] = {}
     for name in sorted(parts):
         frame = pl.concat(parts[name], how="diagonal_relaxed", rechunk=True)

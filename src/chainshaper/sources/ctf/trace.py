@@ -1,4 +1,4 @@
-"""Opening CTF traces: metadata files, packets, what was recorded by which clock, what was lost."""
+"""Open CTF traces: read their metadata, find their packets, say what was lost or is damaged."""
 
 import mmap
 import struct
@@ -25,6 +25,7 @@ from chainshaper.sources.ctf.tsdl import (
 )
 
 _MOST_WARNINGS = 20
+"""Damaged places that are named, of each file; of more only the number is."""
 _ALWAYS = (-(1 << 63), (1 << 63) - 1)
 """Earliest and latest time of the events of a packet that says no times."""
 _REASONS = {
@@ -41,22 +42,18 @@ _REASONS = {
 
 @dataclass(frozen=True)
 class CtfTrace:
-    """Traces opened together.
-
-    ``clock_offset_ns`` added to an event's time gives ns since the Epoch; ``discarded_events`` and
-    ``lost_packets`` are what the tracer says that it dropped, ``damaged_places`` the parts of
-    stream files that are no packets; ``described`` are the folders' types, for the decoder.
-    """
+    """Traces that are opened together."""
 
     folders: tuple[TraceClass, ...]
     streams: tuple[CtfStream, ...]
-    event_names: tuple[str, ...]
-    clock_offset_ns: int
-    discarded_events: int
-    lost_packets: int
-    damaged_places: int
+    event_names: tuple[str, ...]  # that the metadata declares, sorted
+    clock_offset_ns: int  # added to an event's time, it gives ns since the Epoch
+    discarded_events: int  # as the tracer says
+    lost_packets: int  # numbers of packets that are in no file
+    damaged_places: int  # parts of stream files that are no packets
     warnings: tuple[str, ...]
     described: tuple[_core.CtfTraceClass, ...] = field(repr=False, compare=False)
+    """The types of each folder, for the decoder."""
 
 
 def open_trace(*paths: Path | str) -> CtfTrace:
@@ -70,10 +67,10 @@ def open_trace(*paths: Path | str) -> CtfTrace:
     layout = lay_out(folders, described)
     first = folders[0].clock
     warnings = [
-        f"{one.path}: clock {one.clock.name!r} is not the clock of {folders[0].path};"
+        f"{folder.path}: clock {folder.clock.name!r} is not the clock of {folders[0].path};"
         " times of the two cannot be compared"
-        for one in folders[1:]
-        if (one.clock.name, one.clock.uuid) != (first.name, first.uuid)
+        for folder in folders[1:]
+        if (folder.clock.name, folder.clock.uuid) != (first.name, first.uuid)
     ]
     streams, damaged = list[CtfStream](), 0
     for number, folder in enumerate(folders):
@@ -85,8 +82,8 @@ def open_trace(*paths: Path | str) -> CtfTrace:
             if len(packets.packets):
                 streams.append(CtfStream(path, number, packets.packets))
     classes_of_streams = stream_classes(folders)
-    streams, copied = without_copies(streams, classes_of_streams)
-    warnings += copied
+    streams, warnings_of_copies = without_copies(streams, classes_of_streams)
+    warnings += warnings_of_copies
     groups: dict[object, list[CtfStream]] = {}
     for stream in streams:
         kind, instance = (stream.packets[name][0] for name in ("stream_class", "instance"))
@@ -95,11 +92,15 @@ def open_trace(*paths: Path | str) -> CtfTrace:
     losses = [(group[0].path, *_losses(group)) for group in groups.values()]
     for path, discarded, lost in losses:
         if discarded:
-            what = f"the tracer discarded {discarded} events of this stream"
-            warnings.append(f"{path}: {what} (record with more or larger sub-buffers)")
+            warnings.append(
+                f"{path}: the tracer discarded {discarded} events of this stream"
+                " (record with more or larger sub-buffers)"
+            )
         if lost:
-            what = f"{lost} packets of this stream are missing"
-            warnings.append(f"{path}: {what} (overwritten, or not copied with the trace)")
+            warnings.append(
+                f"{path}: {lost} packets of this stream are missing"
+                " (overwritten, or not copied with the trace)"
+            )
     classes = [s for folder in folders for s in folder.streams.values()]
     return CtfTrace(
         folders=tuple(folders),
@@ -115,7 +116,8 @@ def open_trace(*paths: Path | str) -> CtfTrace:
 
 
 def _find(paths: Iterable[Path | str]) -> Iterable[Path]:
-    found: dict[Path, Path] = {}
+    """Return the folders with a file ``metadata`` in and below the paths, each once."""
+    folders: dict[Path, Path] = {}  # by their path without symbolic links
     for path in map(Path, paths):
         here = sorted(p.parent for p in path.rglob("metadata") if p.is_file())
         if not path.exists():
@@ -124,20 +126,21 @@ def _find(paths: Iterable[Path | str]) -> Iterable[Path]:
             reason = "no CTF trace: no file named metadata in it"
             raise CtfError(path, None, reason, "give a trace's folder")
         for folder in here:
-            found.setdefault(folder.resolve(), folder)
-    if not found:
+            folders.setdefault(folder.resolve(), folder)
+    if not folders:
         raise CtfError(".", None, "no trace given")
-    return found.values()
+    return folders.values()
 
 
 def _losses(files: list[CtfStream]) -> tuple[int, int]:
-    """Discarded events and lost packets of one stream (LTTng's packet context, section 5.2).
+    """Count the discarded events and lost packets of a stream, which may have several files.
 
-    ``events_discarded`` counts from the beginning of the stream (32-bit tracers' counters wrap).
-    What the first packet says counts where it is the stream's first; a snapshot or a rotated trace
-    begins anywhere, and what was lost before it is not its own.
+    A packet's context says how many events were discarded since the stream began (LTTng's packet
+    context, section 5.2; counters of 32-bit tracers wrap). If the first packet here is the
+    stream's first, all that it says counts. A snapshot or a rotated trace begins anywhere, and
+    what was discarded before it does not count.
     """
-    # Files of one stream follow each other (tracefile rotation), not always by name.
+    # Files of one stream follow each other (tracefile rotation), but not always in order of name.
     order = np.argsort(_column(files, "begin"), kind="stable")
     counter, sequence = (_column(files, name)[order] for name in ("discarded", "sequence"))
     steps = np.diff(counter, prepend=0 if sequence[0] <= 0 else counter[0])
@@ -155,7 +158,7 @@ def _column(files: list[CtfStream], name: str) -> NDArray[np.int64]:
 
 
 class MappedFile:
-    """A file mapped for reading: its ``bytes``, of so many the ``size``."""
+    """A file mapped for reading: its ``bytes``, and their number, ``size``."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -166,11 +169,11 @@ class MappedFile:
         self.size = len(self.bytes)
 
     def begins_with_zeros(self, start: int) -> bool:
-        """Whether nothing but zeros is where a packet would have its magic number."""
+        """Whether zeros stand where a packet that begins at ``start`` has its magic number."""
         return not any(self.bytes[start : start + 4])
 
     def forget(self, packets: pl.DataFrame) -> None:
-        """Give back the memory of packets in a row; the file's pages stay cached."""
+        """Give back the memory of successive packets; the kernel may still cache the file."""
         first = -(-packets["offset"][0] // mmap.PAGESIZE) * mmap.PAGESIZE
         last = packets["offset"][-1] + packets["size"][-1]
         if last - first >= mmap.PAGESIZE:
@@ -178,36 +181,36 @@ class MappedFile:
 
 
 class _Packets(NamedTuple):
-    """The packets of a stream file (see `CtfStream`), how many places are damaged, and warnings."""
+    """The packets of a stream file, and what is damaged in it."""
 
-    packets: pl.DataFrame
-    damaged: int = 0
+    packets: pl.DataFrame  # see `CtfStream`
+    damaged: int = 0  # places that are no packets
     warnings: tuple[str, ...] = ()
 
 
 def _packets_of(path: Path, layout: _core.CtfLayout, number: int, folder: TraceClass) -> _Packets:
-    """Find the packets of a stream file.
+    """Find the packets of a stream file of the folder with this number.
 
-    Behind a part that makes no sense the file is read on from the next packet of its trace.
+    Where bytes are no packet, the decoder goes on at the next packet of the same trace.
     """
     if path.stat().st_size == 0:
         return _Packets(pl.DataFrame())
     file = MappedFile(path)
-    found = _core.find_packets(layout, number, file.bytes, beginning=_beginning(folder))
-    times = _times_of_events(found.columns, folder, layout.traces[number][0])
-    packets = pl.DataFrame({**found.columns, **times})
-    places = [_damage(path, file, place) for place in found.damaged[:_MOST_WARNINGS]]
-    # A file without any packet is another program's, but for one that has nothing but zeros.
-    ours = len(packets) > 0 or file.begins_with_zeros(0)
-    damaged = len(found.damaged)
+    decoded = _core.find_packets(layout, number, file.bytes, beginning=_beginning(folder))
+    times = _times_of_events(decoded.columns, folder, layout.traces[number][0])
+    packets = pl.DataFrame({**decoded.columns, **times})
+    warnings = [_damage(path, file, place) for place in decoded.damaged[:_MOST_WARNINGS]]
+    # A file without any packet is another program's, unless it has nothing but zeros.
+    is_stream = len(packets) > 0 or file.begins_with_zeros(0)
+    damaged = len(decoded.damaged)
     if damaged > _MOST_WARNINGS:
-        places.append(f"{path}: {damaged - _MOST_WARNINGS} more places are like that")
-        return _Packets(packets, damaged, tuple(places))
-    return _Packets(packets, damaged if ours else 0, tuple(places))
+        warnings.append(f"{path}: {damaged - _MOST_WARNINGS} more places are like that")
+        return _Packets(packets, damaged, tuple(warnings))
+    return _Packets(packets, damaged if is_stream else 0, tuple(warnings))
 
 
 def _damage(path: Path, file: MappedFile, place: _core.CtfDamagedPlace) -> str:
-    """A warning of what is wrong at a place."""
+    """Say what is wrong at a damaged place, and what is not read therefore."""
     reason = _REASONS[place.damage]
     if place.damage == _core.CtfDamage.BAD_MAGIC and file.begins_with_zeros(place.offset):
         reason = "zeros instead of a packet: the disk was full, or the recording was not stopped"
@@ -222,7 +225,10 @@ def _damage(path: Path, file: MappedFile, place: _core.CtfDamagedPlace) -> str:
 
 
 def _beginning(folder: TraceClass) -> bytes:
-    """The bytes that each packet of a trace begins with; none where they are too few to be sure."""
+    """Return the bytes that each packet of a trace begins with: magic number and UUID.
+
+    Returns none where packets have no UUID: the magic number alone may be in an event as well.
+    """
     header = folder.packet_header.fields if folder.packet_header is not None else ()
     match header[:2]:
         case [
@@ -237,24 +243,25 @@ def _beginning(folder: TraceClass) -> bytes:
 def _times_of_events(
     packets: dict[str, NDArray[np.int64]], folder: TraceClass, first_class: int
 ) -> dict[str, NDArray[np.int64]]:
-    """The earliest and the latest time that an event of each packet can have.
+    """Return the columns ``earliest`` and ``latest``: which times events of each packet can have.
 
     ``first_class`` is the number of the folder's first stream class.
-    Tracers of LTTng before 2.11 closed a packet without the events that were being written, which
-    the next packet's beginning bounds; so do packets of a crash, which say no end.
+    LTTng before 2.11 may close a packet while an event is being written into it, so that event is
+    later than the packet's end; and packets of a crash say no end. In both cases the beginning of
+    the next packet is the limit.
     """
     begin, end, stream_class = packets["begin"], packets["end"], packets["stream_class"]
     earliest, latest = (np.full(len(begin), time, np.int64) for time in _ALWAYS)
     major, minor = (folder.env.get(f"tracer_{part}") for part in ("major", "minor"))
     known_version = isinstance(major, int) and isinstance(minor, int)
-    late = known_version and (major, minor) < (2, 11)
+    closes_early = known_version and (major, minor) < (2, 11)
     following = np.append(begin[1:], -1)[: len(begin)]
     following[following < begin] = _ALWAYS[1]
-    last = np.where((end < begin) | late, np.maximum(end, following), end)
+    last = np.where((end < begin) | closes_early, np.maximum(end, following), end)
     for number, stream in enumerate(folder.streams.values(), first_class):
         context = dict(stream.packet_context.fields) if stream.packet_context is not None else {}
         stamps = (context.get(name) for name in ("timestamp_begin", "timestamp_end"))
-        if all(isinstance(one, IntegerType) and one.clock and one.size == 64 for one in stamps):
+        if all(isinstance(kind, IntegerType) and kind.clock and kind.size == 64 for kind in stamps):
             known = (stream_class == number) & (begin > 0)
             earliest[known], latest[known] = begin[known], last[known]
     return {"earliest": earliest, "latest": latest}
@@ -263,7 +270,7 @@ def _times_of_events(
 # The metadata file
 
 METADATA_MAGIC = 0x75D11D57
-_LARGEST = 64 << 20
+_LARGEST = 64 << 20  # bytes
 _RECORD_SEPARATOR = b"\x1e"  # begins every fragment of CTF 2's JSON text sequence
 
 
@@ -275,32 +282,33 @@ def read_metadata(path: Path) -> TraceClass:
     try:
         return replace(parse_tsdl(text), path=path.parent)
     except TsdlError as error:
-        offset, why = error.args
+        offset, reason = error.args
         place = _in_file(len(text[:offset].encode()), pieces)
-        # What is whole ends with a block; what stops too early is all right up to where it stops.
+        # Metadata that is whole ends with a block (`};`) or a comment. Of metadata that stops too
+        # early all is right up to where it stops, so the error is at its end.
         written = text.rstrip(" \t\r\n\0")
         if offset >= len(written) or not written.endswith((";", "*/")):
-            raise _not_whole(path, place, f"the metadata ends in the middle ({why})") from None
+            raise _not_whole(path, place, f"the metadata ends in the middle ({reason})") from None
         remedy = "record again, or report this with the file"
-        raise CtfError(path, place, f"metadata cannot be understood: {why}", remedy) from None
+        raise CtfError(path, place, f"metadata cannot be understood: {reason}", remedy) from None
 
 
-def _not_whole(path: Path, place: int, what: str) -> CtfError:
-    """What to do about metadata that the tracer did not finish."""
+def _not_whole(path: Path, place: int, reason: str) -> CtfError:
+    """Make the error for metadata that the tracer did not finish: what to do about it."""
     uuid = next(filter(None, map(_uuid_in, sorted(path.parent.iterdir()))), None)
     whose = "this trace's UUID" if uuid is None else f"the UUID of this trace, {uuid},"
     return CtfError(
         path,
         place,
-        f"{what}: the session was not stopped and destroyed in order (`lttng destroy`), or the disk"
-        " was full; babeltrace2 cannot read it either",
+        f"{reason}: the session was not stopped and destroyed in order (`lttng destroy`), or the"
+        " disk was full; babeltrace2 cannot read it either",
         "record again; or copy the metadata of a run with the same set-up, whose nodes started in "
         f"the same order, and write {whose} in place of its own: `sed -i s/OLD/NEW/ metadata`",
     )
 
 
 def _uuid_in(path: Path) -> UUID | None:
-    """The UUID that a stream file's first packet says; None where it is no stream."""
+    """Return the UUID in a stream file's first packet; None where it is no stream file."""
     if path.name == "metadata" or not path.is_file():
         return None
     with path.open("rb") as file:
@@ -314,9 +322,10 @@ def _uuid_in(path: Path) -> UUID | None:
 
 
 def read_metadata_text(path: Path) -> tuple[str, list[tuple[int, int]]]:
-    """The TSDL text of a metadata file, plain or in packets (section 7.1), and its pieces.
+    """Read the TSDL text of a metadata file, plain or in packets (section 7.1), and its pieces.
 
-    Each piece is a pair (byte offset in the text, byte offset in the file). Raises `CtfError`.
+    A piece is the part of the text in one packet: (where it begins in the text, and in the file),
+    in bytes. Raises `CtfError`.
     """
     try:
         if path.stat().st_size > _LARGEST:
@@ -341,11 +350,13 @@ def read_metadata_text(path: Path) -> tuple[str, list[tuple[int, int]]]:
 
 
 def _in_file(position: int, pieces: list[tuple[int, int]]) -> int:
+    """Return where in the file a byte of the text is."""
     start, offset = next(p for p in reversed(pieces) if p[0] <= position)
     return offset + position - start
 
 
 def _unpacked(path: Path, data: bytes, order: str) -> tuple[bytes, list[tuple[int, int]]]:
+    """Take the text and its pieces out of packets whose integers have this byte order."""
     header = struct.Struct(order + "I16sIIIBBBBB")
     text, pieces, offset = bytearray(), [], 0
     while offset < len(data):

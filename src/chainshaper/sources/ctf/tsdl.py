@@ -1,7 +1,8 @@
-"""What a trace's metadata says, from its text in TSDL (CTF 1.8, sections 4 and 7, appendix C).
+"""Parse a trace's metadata, a text in TSDL (CTF 1.8, sections 4 and 7, appendix C).
 
-Names stay as TSDL writes them, with LTTng's leading underscore; `field_name` gives the name that
-users see. Sizes and alignments are in bits.
+`parse_tsdl` returns a `TraceClass`: what the text declares. Names stay as TSDL writes them, with
+LTTng's leading underscore; `field_name` returns the name that users see. Sizes and alignments are
+in bits.
 """
 
 from __future__ import annotations
@@ -34,18 +35,16 @@ class TsdlError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class IntegerType:
-    """``integer { … }`` (section 4.1.5), or ``enum`` (4.1.8).
-
-    ``clock`` is the name of the clock it is mapped to; ``mappings`` are labels and closed ranges of
-    values (low, high), which may overlap. Other labels make no other type: values lie alike.
-    """
+    """``integer { … }`` (section 4.1.5), or ``enum`` (4.1.8)."""
 
     size: int
     align: int
     signed: bool = False
     byte_order: Literal["native", "le", "be"] = "native"
-    encoded: bool = False  # as UTF-8 or ASCII
-    clock: str | None = None
+    encoded: bool = False  # whether it is a character, in UTF-8 or ASCII
+    clock: str | None = None  # the name of the clock that it is mapped to
+    # Of an enumeration, each label with its range of values (lowest, highest); ranges may overlap.
+    # Types that differ in labels only are equal, since their values have the same bits.
     mappings: tuple[tuple[str, int, int], ...] = field(default=(), compare=False)
 
 
@@ -56,33 +55,35 @@ class StringType:
 
 @dataclass(frozen=True, slots=True)
 class ArrayType:
-    """``T name[length]`` (section 4.2.3); of a sequence (4.2.4) the path as written, ``a.b.c``."""
+    """``T name[length]``: an array (section 4.2.3), or a sequence (4.2.4)."""
 
     element: Type
-    length: int | str
+    length: int | str  # of a sequence, the path of the field that has it as written: ``a.b.c``
 
 
 class Field(NamedTuple):
+    """A field of a structure, or an option of a variant."""
+
     name: str
     type: Type
 
 
 @dataclass(frozen=True, slots=True)
 class StructType:
-    """``struct { … } align(n)`` (section 4.2.1); ``align`` is at least ``n`` and each field's.
+    """``struct { … } align(n)`` (section 4.2.1).
 
-    ``floating_point`` (4.1.7) is a structure of one integer: of neither there is a column.
+    ``floating_point`` (4.1.7) is a structure with one integer: neither gets a column.
     """
 
     fields: tuple[Field, ...] = ()
-    align: int = 1
+    align: int = 1  # at least ``n``, and at least that of each field
 
 
 @dataclass(frozen=True, slots=True)
 class VariantType:
-    """``variant <tag> { … }`` (section 4.2.2); ``tag`` is the path as written or ``None``."""
+    """``variant <tag> { … }`` (section 4.2.2)."""
 
-    tag: str | None
+    tag: str | None  # the path of the field that says which option follows, as written
     options: tuple[Field, ...]
 
 
@@ -91,11 +92,11 @@ Type = IntegerType | StringType | ArrayType | StructType | VariantType
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """``clock { … }`` (section 8): ``frequency`` in Hz, ``offset_ns`` from the Epoch, exact."""
+    """``clock { … }`` (section 8)."""
 
     name: str
-    frequency: int = 1_000_000_000
-    offset_ns: int = 0
+    frequency: int = 1_000_000_000  # Hz
+    offset_ns: int = 0  # of its zero from the Epoch
     uuid: str | None = None
 
 
@@ -122,10 +123,7 @@ class StreamClass:
 
 @dataclass(frozen=True, slots=True)
 class TraceClass:
-    """Everything one ``metadata`` file declares, and the folder that it is in.
-
-    ``referenced`` are the names of the fields that lengths and tags refer to.
-    """
+    """Everything that a file ``metadata`` declares, and the folder that it is in."""
 
     byte_order: Literal["le", "be"]
     uuid: str | None
@@ -133,22 +131,22 @@ class TraceClass:
     env: Mapping[str, str | int]
     clocks: Mapping[str, Clock]
     streams: Mapping[int, StreamClass]
-    referenced: frozenset[str]
+    referenced: frozenset[str]  # names of the fields that lengths and tags refer to
     path: Path = Path()
 
     @property
     def clock(self) -> Clock:
-        """The trace's clock, of 1 GHz where there is none."""
+        """The first clock that is declared; one of 1 GHz if there is none."""
         return next(iter(self.clocks.values()), Clock("none"))
 
 
 def field_name(name: str) -> str:
-    """The name users see: TSDL's without one leading underscore, as babeltrace2 shows it."""
+    """Return the name that users see: without one leading underscore, as babeltrace2 shows it."""
     return name.removeprefix("_") or name
 
 
 def alignment(kind: Type) -> int:
-    """The alignment of a type in bits (section 4.1.2, 4.2); a variant has none of its own."""
+    """Return the alignment of a type in bits (sections 4.1.2, 4.2); a variant has none: 1."""
     match kind:
         case ArrayType(element):
             return alignment(element)
@@ -169,11 +167,11 @@ def is_text(kind: Type) -> bool:
 
 
 class Token(NamedTuple):
-    """A word, integer, string or mark, its text (strings unescaped) and its character offset."""
+    """A piece of the text that belongs together: a word, a number, a string, a mark."""
 
-    kind: str
-    text: str
-    offset: int
+    kind: str  # "word", "integer", "string", "mark" or "end"
+    text: str  # of a string without quotes and escapes; of an integer in decimal digits
+    offset: int  # in characters
 
 
 _TOKEN = re.compile(
@@ -195,41 +193,43 @@ _ESCAPES = {"n": "\n", "t": "\t", "r": "\r", "a": "\a", "b": "\b", "f": "\f", "v
 
 
 def _tokens(text: str) -> list[Token]:
-    """The tokens of ``text`` without white space and comments, closed by one of kind ``end``."""
+    """Cut ``text`` into tokens, without white space and comments; the last is of kind ``end``."""
     tokens: list[Token] = []
     for match in _TOKEN.finditer(text):
-        kind, found, offset = str(match.lastgroup), match.group(), match.start()
+        kind, piece, offset = str(match.lastgroup), match.group(), match.start()
         if len(tokens) > _MOST_TOKENS:
             raise TsdlError(offset, f"more than {_MOST_TOKENS} tokens")
         match kind:
             case "space":
                 continue
             case "wrong":
-                reason = f"unexpected character {found!r}"
-                if found in "\"'":
+                reason = f"unexpected character {piece!r}"
+                if piece in "\"'":
                     reason = "unterminated string"
                 elif text.startswith("/*", offset):
                     reason = "unterminated comment"
                 raise TsdlError(offset, reason)
             case "string":
-                found = _unescape(found[found.index('"') + 1 : -1])
+                piece = _unescape(piece[piece.index('"') + 1 : -1])
             case "character":
-                kind, found = "integer", str(ord(_unescape(found[1:-1])[:1]))
+                kind, piece = "integer", str(ord(_unescape(piece[1:-1])[:1]))
             case "integer":
-                if len(found) > 80:
+                if len(piece) > 80:
                     raise TsdlError(offset, "integer out of range")
-                digits = found.rstrip("uUlL")
+                digits = piece.rstrip("uUlL")
                 octal = digits[0] == "0" and re.fullmatch("0[0-7]+", digits)
-                found = str(int(digits, 8 if octal else 10 if digits.isdecimal() else 0))
-        tokens.append(Token(kind, found, offset))
+                piece = str(int(digits, 8 if octal else 10 if digits.isdecimal() else 0))
+        tokens.append(Token(kind, piece, offset))
     return [*tokens, Token("end", "", len(text))]
 
 
 def _unescape(text: str) -> str:
+    """Replace the escape sequences of C in a string or character."""
+
     def value(match: re.Match[str]) -> str:
-        hexadecimal, octal, other = match.groups()
-        if other is not None:
-            return _ESCAPES.get(other, other)
+        hexadecimal, octal, character = match.groups()
+        if character is not None:
+            return _ESCAPES.get(character, character)
         return chr(int(hexadecimal, 16) if hexadecimal else int(octal, 8) & 0xFF)
 
     return _ESCAPE.sub(value, text)
@@ -237,7 +237,8 @@ def _unescape(text: str) -> str:
 
 # Blocks and basic types
 
-_CHOICES: dict[str, dict[int | str, Any]] = {  # of what each may be, what is meant without it first
+# Attribute → the values that it may have in TSDL → what each means. The first is the default.
+_CHOICES: dict[str, dict[int | str, Any]] = {
     "byte_order": {"native": "native", "le": "le", "be": "be", "network": "be"},
     "signed": {0: False, "false": False, "FALSE": False, 1: True, "true": True, "TRUE": True},
     "encoding": {"none": False, "utf8": True, "ascii": True},
@@ -245,36 +246,41 @@ _CHOICES: dict[str, dict[int | str, Any]] = {  # of what each may be, what is me
 
 
 class _Block(dict[str, tuple[int | str | Type, int]]):
-    """``{ name = value; name := type; … }``: values with their offsets, and the block's own."""
+    """``{ name = value; name := type; … }``: name → (value, its offset); and the block's offset.
+
+    The methods return an attribute's value, or a default where the block does not have it. They
+    raise TsdlError where the value is of another kind.
+    """
 
     offset = 0
 
-    def typed(self, name: str, wanted: type[_T], what: str) -> _T | None:
-        """A value of a type, None where there is none; TsdlError where it is another."""
+    def typed(self, name: str, wanted: type[_T], kind: str) -> _T | None:
+        """Return a value of a type, which messages call ``kind``."""
         value, offset = self.get(name, (None, 0))
         if value is not None and not isinstance(value, wanted):
-            found = repr(value) if isinstance(value, int | str) else "a type"
-            raise TsdlError(offset, f"{name} must be {what}, not {found}")
+            given = repr(value) if isinstance(value, int | str) else "a type"
+            raise TsdlError(offset, f"{name} must be {kind}, not {given}")
         return value
 
     def struct(self, name: str) -> StructType | None:
         return self.typed(name, StructType, "a structure")
 
     def number(self, name: str, default: int = 0) -> int:
-        found = self.typed(name, int, "an integer")
-        return default if found is None else found
+        value = self.typed(name, int, "an integer")
+        return default if value is None else value
 
     def identifier(self, name: str, default: int = 0) -> int:
-        found = self.number(name, default)
-        if not 0 <= found < 1 << 63:
-            raise TsdlError(self[name][1], f"{name} must be an unsigned integer, not {found}")
-        return found
+        value = self.number(name, default)
+        if not 0 <= value < 1 << 63:
+            raise TsdlError(self[name][1], f"{name} must be an unsigned integer, not {value}")
+        return value
 
     def text(self, name: str) -> str | None:
         value = self.get(name, (None, 0))[0]
         return value if isinstance(value, str) else None
 
     def choice(self, name: str) -> Any:
+        """Return what the value of an attribute of :data:`_CHOICES` means."""
         choices = _CHOICES[name]
         value, offset = self.get(name, (next(iter(choices)), 0))
         if isinstance(value, str) and name == "encoding":
@@ -288,6 +294,7 @@ class _Block(dict[str, tuple[int | str | Type, int]]):
         return _checked_alignment(self.number("align", default), self.offset)
 
     def integer_type(self) -> IntegerType:
+        """Return the type that this block of ``integer { … }`` describes."""
         size = self.number("size")
         if not 0 < size <= 64:
             raise TsdlError(self.offset, f"integer of {size} bits; 1 to 64 are supported")
@@ -300,6 +307,7 @@ class _Block(dict[str, tuple[int | str | Type, int]]):
         return IntegerType(size, align, signed, order, encoded, clock and clock[1])
 
     def float_type(self) -> StructType:
+        """Return the type that this block of ``floating_point { … }`` describes."""
         exponent, mantissa = self.number("exp_dig"), self.number("mant_dig")
         if (exponent, mantissa) not in ((8, 24), (11, 53)):
             given = f"floating point of {exponent} + {mantissa} bits"
@@ -318,39 +326,45 @@ def _checked_alignment(align: int, offset: int) -> int:
 # Grammar
 
 _DEEPEST = 32
+"""Blocks inside blocks, and dimensions of arrays: hostile metadata must not exhaust the stack."""
 _DECLARING = frozenset(("typealias", "typedef", "struct", "variant", "enum"))
 
 
 @dataclass
 class _Parser:
-    """A position in a list of tokens and the type names known there."""
+    """Reads a list of tokens from front to back: a method for each thing of the grammar."""
 
     tokens: list[Token]
-    position: int = 0
-    scope: ChainMap[str, Type] = field(default_factory=ChainMap)
-    referenced: set[str] = field(default_factory=set)
+    position: int = 0  # of the next token
+    scope: ChainMap[str, Type] = field(default_factory=ChainMap)  # types with a name, by name
+    referenced: set[str] = field(default_factory=set)  # names of fields in lengths and tags
 
     @property
     def token(self) -> Token:
+        """The next token."""
         return self.tokens[self.position]
 
     def fail(self, reason: str) -> NoReturn:
         raise TsdlError(self.token.offset, reason)
 
     def at(self, text: str) -> bool:
-        """Whether the token is the word or mark ``text``."""
+        """Whether the next token is the word or mark ``text``."""
         return self.token.text == text and self.token.kind in ("word", "mark")
 
     def accept(self, text: str) -> bool:
-        found = self.at(text)
-        self.position += found
-        return found
+        """Go over the word or mark ``text`` if it is the next token; whether it is."""
+        if not self.at(text):
+            return False
+        self.position += 1
+        return True
 
     def expect(self, text: str) -> None:
+        """Go over the word or mark ``text``, which must be the next token."""
         if not self.accept(text):
             self.fail(f"expected {text!r}, found {self.token.text!r}")
 
     def take(self, kind: str) -> str:
+        """Go over the next token, which must be of a kind; return its text."""
         token = self.token
         if token.kind != kind:
             self.fail(f"expected a {kind}, found {token.text!r}")
@@ -359,7 +373,7 @@ class _Parser:
 
     @contextmanager
     def braces(self) -> Iterator[None]:
-        """Braces with a type scope of their own; nesting is bounded against hostile files."""
+        """Go over braces, in which names of types may be declared that end with them."""
         self.expect("{")
         if len(self.scope.maps) > _DEEPEST:
             self.fail(f"more than {_DEEPEST} nested blocks")
@@ -369,12 +383,14 @@ class _Parser:
         self.expect("}")
 
     def path(self) -> str:
+        """Read ``a.b->c``; return it with dots."""
         parts = [self.take("word")]
         while self.accept(".") or self.accept("->"):
             parts.append(self.take("word"))
         return ".".join(parts)
 
     def reference(self) -> str:
+        """Read the path of a field that a length or tag refers to."""
         path = self.path()
         self.referenced.add(path.rpartition(".")[2])
         return path
@@ -387,6 +403,7 @@ class _Parser:
         return sign * int(self.take("integer"))
 
     def value(self) -> int | str:
+        """Read what stands behind ``=``: strings in a row, which are one; a path; an integer."""
         text = ""
         if self.token.kind == "string":
             while self.token.kind == "string":
@@ -395,25 +412,26 @@ class _Parser:
         return self.path() if self.token.kind == "word" else self.integer()
 
     def block(self) -> _Block:
-        found = _Block()
-        found.offset = self.tokens[self.position - 1].offset
+        """Read ``{ name = value; name := type; … }``, in which types may be declared too."""
+        block = _Block()
+        block.offset = self.tokens[self.position - 1].offset
         with self.braces():
             while not self.at("}"):
                 if self.declaration():
                     continue
                 offset, name = self.token.offset, self.path()
-                if name in found:
+                if name in block:
                     raise TsdlError(offset, f"{name} given twice")
                 typed = self.accept(":=")
                 if not typed:
                     self.expect("=")
                 offset = self.token.offset
-                found[name] = (self.type(declares=False) if typed else self.value(), offset)
+                block[name] = (self.type(declares=False) if typed else self.value(), offset)
                 self.expect(";")
-        return found
+        return block
 
     def type(self, *, declares: bool) -> Type:
-        """A type specifier; ``declares`` says that a declarator's name follows it."""
+        """Read a type; ``declares``: the name of what has this type follows, and is not read."""
         while self.accept("const"):
             pass
         if self.token.kind != "word":
@@ -445,7 +463,7 @@ class _Parser:
         return self.scope[name]
 
     def _compound(self, keyword: str) -> Type:
-        """What follows ``struct``, ``variant`` or ``enum``: a name, a body, or both."""
+        """Read what follows ``struct``, ``variant`` or ``enum``: a name, a body, or both."""
         name, tag, container = "", None, self.scope.get("int")
         if self.token.kind == "word" and not (keyword == "struct" and self.at("align")):
             name = f"{keyword} {self.take('word')}"
@@ -493,7 +511,7 @@ class _Parser:
         return tuple(fields)
 
     def _declarators(self, kind: Type) -> Iterator[Field]:
-        """``name``, ``name[length]`` …, with commas between them."""
+        """Read ``name``, ``name[length]`` …, with commas between them."""
         more = True
         while more:
             name = self.take("word")
@@ -570,39 +588,39 @@ def parse_tsdl(text: str) -> TraceClass:
     something undeclared, or declares something twice.
     """
     parser = _Parser(_tokens(text))
-    found: dict[str, list[_Block]]
-    found = {name: [] for name in ("trace", "env", "clock", "callsite", "stream", "event")}
+    kinds = ("trace", "env", "clock", "callsite", "stream", "event")
+    blocks: dict[str, list[_Block]] = {kind: [] for kind in kinds}
     while parser.token.kind != "end":
         if parser.declaration():
             continue
         offset, keyword = parser.token.offset, parser.take("word")
-        if keyword not in found:
+        if keyword not in blocks:
             raise TsdlError(offset, f"unknown block {keyword!r}")
-        found[keyword].append(parser.block())
+        blocks[keyword].append(parser.block())
         parser.expect(";")
-    if not found["trace"]:
+    if not blocks["trace"]:
         raise TsdlError(0, "no trace block")
-    trace, *others = found["trace"]
-    if others:
-        raise TsdlError(others[0].offset, "a second trace block")
+    trace, *further = blocks["trace"]
+    if further:
+        raise TsdlError(further[0].offset, "a second trace block")
     order = trace.text("byte_order")
     if order not in ("le", "be", "network"):
         raise TsdlError(0, f"trace byte_order must be le or be, not {order!r}")
-    environment = {n: v for block in found["env"] for n, (v, _) in block.items()}
-    clocks = map(_clock, found["clock"])
+    environment = {name: value for block in blocks["env"] for name, (value, _) in block.items()}
+    clocks = map(_clock, blocks["clock"])
     return TraceClass(
         byte_order="le" if order == "le" else "be",
         uuid=trace.text("uuid"),
         packet_header=trace.struct("packet.header"),
         env={name: value for name, value in environment.items() if isinstance(value, int | str)},
         clocks={clock.name: clock for clock in clocks},
-        streams=_streams(found["stream"], found["event"]),
+        streams=_streams(blocks["stream"], blocks["event"]),
         referenced=frozenset(parser.referenced),
     )
 
 
 _LARGEST_OFFSET_NS = 1 << 62
-"""Times and their offset together are still numbers of 64 bits."""
+"""So that a time and its offset, added, are still a number of 64 bits."""
 
 
 def _clock(block: _Block) -> Clock:
@@ -622,6 +640,10 @@ def _clock(block: _Block) -> Clock:
 
 
 def _streams(blocks: list[_Block], events: list[_Block]) -> dict[int, StreamClass]:
+    """Return the stream classes by id, each with its event classes.
+
+    An event that names no stream is of the only one, or of stream 0.
+    """
     streams: dict[int, StreamClass] = {}
     for block in blocks:
         identifier = block.identifier("id")
@@ -642,6 +664,6 @@ def _streams(blocks: list[_Block], events: list[_Block]) -> dict[int, StreamClas
             raise TsdlError(block.offset, f"event {name!r} {undeclared}")
         if identifier in stream.events:
             raise TsdlError(block.offset, f"event {name!r}: id {identifier} declared twice")
-        own = EventClass(identifier, name, block.struct("context"), block.struct("fields"))
-        stream.events[identifier] = own
+        context, fields = block.struct("context"), block.struct("fields")
+        stream.events[identifier] = EventClass(identifier, name, context, fields)
     return streams

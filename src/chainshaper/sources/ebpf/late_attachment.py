@@ -1,8 +1,9 @@
-"""Who exists in an application that ran before tracing began, as far as it can be found out.
+"""Find the objects of an application that ran before tracing began, as far as possible.
 
-Objects say who they are when they are created. For those created before, the same tables are filled
-with what is known otherwise (`docs/record_ebpf.md`); what is not certain is left open. Handles are
-the real ones where events carry them, else other addresses of the object; nodes count from 1.
+Events name an object when it is created. For objects created before, these functions fill the same
+tables from what else is recorded (`docs/record_ebpf.md`), and leave null what is not certain.
+Handles are the real ones where events have them, else other addresses of the object; handles of
+nodes are numbers from 1.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,12 +23,14 @@ ADDED = (
 )
 """The events that make callbacks known."""
 
+# Shares of a callback's starts.
 _NEARLY_ALWAYS = 0.9
 _MOSTLY = 0.5
 _REGULAR = 0.25
-"""Distances of a timer's starts: by this share of the usual one they are off at most, mostly."""
+"""A timer's start is regular if its distance from the one before is off the usual distance by no
+more than this share of it."""
 _FEWEST_STARTS = 4
-_PERIOD_GRID_NS = 100_000
+_PERIOD_GRID_NS = 100_000  # to which measured periods are rounded
 
 _CALLBACK = ["pid", "callback"]
 _THREAD = ["time", "pid", "tid"]
@@ -37,15 +40,17 @@ _KINDS = ("publisher", "subscription")
 def with_found_objects(
     tables: events.EventTables, handles: pl.DataFrame, began_ns: int
 ) -> tuple[events.EventTables, tuple[str, ...]]:
-    """Add publishers, subscriptions and callbacks that were there at ``began_ns``; and a note.
+    """Add the publishers, subscriptions and callbacks that were created before ``began_ns``.
 
-    ``handles`` has the columns ``pid, event, handle, topic``.
+    Returns the tables, and a note on what was added. ``handles`` are those that events had, with
+    the topic's name in their memory (see `Printed`).
     """
-    handles = handles.filter(pl.col("topic").str.starts_with("/"))  # others are the RMW's own
+    handles = handles.filter(pl.col("topic").str.starts_with("/"))  # others are of the RMW itself
     publishers = _publishers(tables, handles)
     known = events.table(tables, "rcl_subscription_init")
-    subscriptions = _of(handles, "rmw_take", "rmw_subscription_handle", known)
+    subscriptions = _unknown_handles(handles, "rmw_take", "rmw_subscription_handle", known)
     starts = _unregistered_starts(tables)
+    # A callback that nearly always starts after a take from the same subscription is that one's.
     usual = pl.col("taken").drop_nulls().mode().first().alias("rmw_subscription_handle")
     share = (pl.col("taken") == usual).fill_null(False).mean()
     readers = (
@@ -58,13 +63,13 @@ def with_found_objects(
     handle = pl.col("rmw_subscription_handle").alias("subscription_handle")
     readers = readers.with_columns(handle, subscription="callback")
     timers = timers.with_columns(timer_handle="callback")
-    found = {
+    created_before = {
         "rcl_publisher_init": publishers,
         "rcl_subscription_init": subscriptions.with_columns(handle),
         **dict.fromkeys(("rclcpp_subscription_init", ADDED[0]), readers),
         **dict.fromkeys(("rcl_timer_init", ADDED[1]), timers),
     }
-    if not any(rows.height for rows in found.values()):
+    if not any(rows.height for rows in created_before.values()):
         return tables, ()
     note = (
         f"tracing began while the application ran; found were publishers ({publishers.height}) and "
@@ -73,13 +78,16 @@ def with_found_objects(
         f"({timers.height}) by their regularity (with measured periods). Services, and what was "
         "idle, cannot be known."
     )
-    return {**tables, **added_rows(tables, found, began_ns)}, (note,)
+    return {**tables, **added_rows(tables, created_before, began_ns)}, (note,)
 
 
 def with_functions(
     tables: events.EventTables, functions: Mapping[tuple[int, int], str], began_ns: int
 ) -> events.EventTables:
-    """Add what `rclcpp_callback_register` has not shown: (process, callback) → its function."""
+    """Add functions of callbacks, (process, callback) → function, to `rclcpp_callback_register`.
+
+    Those that the table has already stay. A new row has the time at which its callback was added.
+    """
     named = pl.DataFrame(
         [(*callback, symbol) for callback, symbol in functions.items()],
         schema={"pid": pl.Int32, "callback": pl.UInt64, "symbol": pl.String},
@@ -95,39 +103,46 @@ def with_functions(
 def added_rows(
     tables: events.EventTables, rows: Mapping[str, pl.DataFrame], began_ns: int
 ) -> dict[str, pl.DataFrame]:
-    """The tables that get new rows, as events of ``began_ns`` where no ``time`` says otherwise."""
-    added = {}
-    for name, found in rows.items():
-        if found.height:
-            new, known = events.table({name: found}, name, ["time"]), events.table(tables, name)
+    """Return the tables that get new rows, without the others.
+
+    Rows without a ``time`` become events of ``began_ns``; their thread is the process's main one.
+    """
+    extended = {}
+    for name, new_rows in rows.items():
+        if new_rows.height:
+            new, known = events.table({name: new_rows}, name, ["time"]), events.table(tables, name)
             new = new.with_columns(pl.col("time").fill_null(began_ns), tid="pid")
             both = pl.concat([new, known], how="diagonal").select(known.columns)
-            added[name] = both.sort("time", maintain_order=True)
-    return added
+            extended[name] = both.sort("time", maintain_order=True)
+    return extended
 
 
-def _of(handles: pl.DataFrame, event: str, column: str, known: pl.DataFrame) -> pl.DataFrame:
-    """``pid, <column>, topic_name`` of the handles read at an event that are not yet known."""
-    named = pl.col("handle").alias(column)
-    found = handles.filter(event=event).select("pid", named, topic_name="topic")
-    return found.join(known, on=["pid", column], how="anti")
+def _unknown_handles(
+    handles: pl.DataFrame, event: str, column: str, known: pl.DataFrame
+) -> pl.DataFrame:
+    """Return ``pid, <column>, topic_name`` of an event's handles that are not in ``known``."""
+    renamed = pl.col("handle").alias(column)
+    at_event = handles.filter(event=event).select("pid", renamed, topic_name="topic")
+    return at_event.join(known, on=["pid", column], how="anti")
 
 
-def _threads_rows(*marks: pl.DataFrame) -> pl.DataFrame:
-    return pl.concat(marks, how="diagonal").sort("time", maintain_order=True)
+def _in_order(*frames: pl.DataFrame) -> pl.DataFrame:
+    """Return the rows of several frames in order of time."""
+    return pl.concat(frames, how="diagonal").sort("time", maintain_order=True)
 
 
 def _publishers(tables: events.EventTables, handles: pl.DataFrame) -> pl.DataFrame:
-    """``pid, publisher_handle, rmw_publisher_handle, topic_name`` of those created before.
+    """Return ``pid, publisher_handle, rmw_publisher_handle, topic_name`` of unknown publishers.
 
-    `rcl_publish` and the `rmw_publish` of the same message have one handle of a publisher each.
+    A publisher has a handle of rcl, in `rcl_publish`, and one of rmw, in `rmw_publish`. The events
+    of one message show which two belong together.
     """
     key = ["pid", "rmw_publisher_handle"]
     known = events.table(tables, "rcl_publisher_init")
     published = events.table(tables, "rcl_publish")
     written = events.table(tables, "rmw_publish", key[1:])
-    both = (
-        _threads_rows(
+    pairs = (
+        _in_order(
             published.select(*_THREAD, "message", "publisher_handle"),
             written.select(*_THREAD, "message", key[1]),
         )
@@ -136,19 +151,25 @@ def _publishers(tables: events.EventTables, handles: pl.DataFrame) -> pl.DataFra
         .group_by(key)
         .agg(pl.col("publisher_handle").mode().first())
     )
-    by_rmw = _of(handles, "rmw_publish", key[1], known).join(both, on=key, how="left")
-    by_rcl = _of(handles, "rcl_publish", "publisher_handle", known)
+    by_rmw = _unknown_handles(handles, "rmw_publish", key[1], known)
+    by_rmw = by_rmw.join(pairs, on=key, how="left")
+    by_rcl = _unknown_handles(handles, "rcl_publish", "publisher_handle", known)
     return pl.concat([by_rmw, by_rcl], how="diagonal")
 
 
 def _unregistered_starts(tables: events.EventTables) -> pl.DataFrame:
-    """``time, pid, callback, taken`` of starts of unregistered callbacks.
+    """Return the starts of callbacks whose creation was not traced.
 
-    ``taken``: the subscription from which the thread had just taken a message, null if none.
+    Columns:
+
+    * ``time``: when it started (ns)
+    * ``pid``, ``callback``
+    * ``taken``: the rmw handle of the subscription from which the thread had taken a message right
+      before; null if it had not
     """
     takes = events.table(tables, "rmw_take", ["taken"]).filter(pl.col("taken").fill_null(1) != 0)
     starts = events.table(tables, "callback_start", ["is_intra_process"])
-    rows = _threads_rows(
+    rows = _in_order(
         takes.select(*_THREAD, handle="rmw_subscription_handle"),
         starts.select(*_THREAD, "callback", "is_intra_process"),
         events.table(tables, "callback_end").select(*_THREAD),
@@ -159,17 +180,17 @@ def _unregistered_starts(tables: events.EventTables) -> pl.DataFrame:
 
 
 def _timers(starts: pl.DataFrame) -> pl.DataFrame:
-    """``pid, callback, period`` of callbacks that start regularly without a message."""
+    """Return ``pid, callback, period`` of callbacks that start regularly without a message."""
     gaps = starts.sort("time").with_columns(gap=pl.col("time").diff().over(_CALLBACK))
     usual = pl.col("gap").median()
     regular = (pl.col("gap") - usual).abs() <= _REGULAR * usual
     taken, period = pl.col("taken").count(), (usual / _PERIOD_GRID_NS).round() * _PERIOD_GRID_NS
     is_timer = (pl.len() >= _FEWEST_STARTS) & (taken <= (1 - _NEARLY_ALWAYS) * pl.len())
-    found = gaps.group_by(_CALLBACK).agg(
+    judged = gaps.group_by(_CALLBACK).agg(
         is_timer=is_timer & (regular.mean() >= _MOSTLY),
         period=pl.when(period > 0).then(period).otherwise(usual).cast(pl.Int64),
     )
-    return found.filter("is_timer").drop("is_timer")
+    return judged.filter("is_timer").drop("is_timer")
 
 
 def with_found_nodes(
@@ -178,10 +199,11 @@ def with_found_nodes(
     endpoints: Sequence[EndpointInfo],
     processes: Iterable[RunningProcess],
 ) -> tuple[events.EventTables, RecordingInfo]:
-    """Give publishers, subscriptions and timers without a node theirs, where it is certain.
+    """Add the nodes of publishers, subscriptions and timers that have none, where it is certain.
 
-    In the ``endpoints`` of DDS discovery, a topic that one node only publishes says whose publisher
-    it is, and which node lives in that process. What stays unknown becomes a note.
+    If in the ``endpoints`` of DDS discovery a single node publishes a topic, the publisher of that
+    topic is that node's, and the node is in the publisher's process; likewise for subscriptions.
+    The command lines of ``processes`` may name nodes, too. A note says what stays unknown.
     """
     created = {kind: events.table(tables, f"rcl_{kind}_init") for kind in _KINDS}
     nameless = pl.concat(
@@ -191,7 +213,7 @@ def with_found_nodes(
     if nameless.is_empty():
         return tables, info
     wanted = list(nameless.drop("time").iter_rows())
-    named = {one.pid: named_nodes(one.command) for one in processes}
+    named = {process.pid: named_nodes(process.command) for process in processes}
     owners, nodes_of = _owners(wanted, endpoints, named)
     numbers = {
         (pid, node): number
@@ -201,9 +223,9 @@ def with_found_nodes(
     changed: dict[str, pl.DataFrame] = dict(tables)
     for kind, rows in created.items():
         keys = rows.select(*_endpoint(kind)).iter_rows()
-        found = [numbers[key[1], owners[key]] if key in owners else None for key in keys]
-        if any(found):
-            node = pl.col("node_handle").fill_null(pl.Series(found, dtype=pl.UInt64))
+        handles = [numbers[key[1], owners[key]] if key in owners else None for key in keys]
+        if any(handles):
+            node = pl.col("node_handle").fill_null(pl.Series(handles, dtype=pl.UInt64))
             changed[f"rcl_{kind}_init"] = rows.with_columns(node)
     parts = [
         (pid, number, node.rpartition("/")[0] or "/", node.rpartition("/")[2])
@@ -223,6 +245,7 @@ def with_found_nodes(
 
 
 def _endpoint(kind: str) -> tuple[pl.Expr, ...]:
+    """Return the columns that say which endpoint a row is about: kind, process, topic."""
     return pl.lit(kind).alias("kind"), pl.col("pid"), pl.col("topic_name")
 
 
@@ -231,37 +254,46 @@ def _owners(
     endpoints: Iterable[EndpointInfo],
     named: Mapping[int, Sequence[str]],
 ) -> tuple[dict[tuple[str, int, str], str], dict[int, set[str]]]:
-    """(Kind, process, topic) → node, where that is certain; process → the nodes known in it."""
+    """Find the nodes of endpoints.
+
+    Returns (kind, process, topic) → node, where that is certain; and process → the nodes that are
+    known to be in it. ``named`` are the nodes that command lines of processes name.
+    """
     candidates: dict[tuple[str, str], set[str]] = {}
-    for one in endpoints:
-        candidates.setdefault((one.kind, one.topic), set()).add(one.node)
+    for endpoint in endpoints:
+        candidates.setdefault((endpoint.kind, endpoint.topic), set()).add(endpoint.node)
     nodes_of = {pid: set(named.get(pid, ())) for _, pid, _ in wanted}
     for kind, pid, topic in wanted:
         if len(candidates.get((kind, topic), ())) == 1:
             nodes_of[pid] |= candidates[kind, topic]
     owners = {}
     for kind, pid, topic in wanted:
-        found = candidates.get((kind, topic), nodes_of[pid])
-        if len(found) > 1:
-            found = found & nodes_of[pid]
-        if len(found) == 1:
-            (owners[kind, pid, topic],) = found
+        possible = candidates.get((kind, topic), nodes_of[pid])
+        if len(possible) > 1:
+            possible = possible & nodes_of[pid]
+        if len(possible) == 1:
+            (owners[kind, pid, topic],) = possible
     return owners, nodes_of
 
 
 def _timer_links(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
-    """``pid, timer_handle, node_handle`` of timers that no event links to one of the ``nodes``."""
+    """Return ``pid, timer_handle, node_handle`` of timers that no event links to a node.
+
+    A timer is of the only node in its process, or else of the node whose publishers its callback
+    uses. Timers of which neither is known are left out.
+    """
     timers, linked = (events.table(tables, name) for name in (ADDED[1], "rclcpp_timer_link_node"))
     timers = timers.join(linked, on=["pid", "timer_handle"], how="anti")
-    alone = nodes.select("pid", alone="node_handle").unique("pid", keep="none")
+    only_nodes = nodes.select("pid", only_node="node_handle").unique("pid", keep="none")
     started = events.table(tables, "callback_start")
     ended = events.table(tables, "callback_end").with_columns(callback=pl.lit(0, pl.UInt64))
     published = events.table(tables, "rcl_publish").select(*_THREAD, "publisher_handle")
     created = events.table(tables, "rcl_publisher_init")
     owners = created.select("pid", "publisher_handle", "node_handle").drop_nulls()
-    called = [marks.select(*_THREAD, "callback") for marks in (started, ended)]
-    publishing = (  # whose publishers callbacks use, mostly
-        _threads_rows(*called, published)
+    called = [frame.select(*_THREAD, "callback") for frame in (started, ended)]
+    # Callback → the node whose publishers it uses most often.
+    publishing = (
+        _in_order(*called, published)
         .with_columns(pl.col("callback").forward_fill().over("pid", "tid"))
         .drop_nulls(["publisher_handle", "callback"])
         .filter(pl.col("callback") != 0)
@@ -270,8 +302,8 @@ def _timer_links(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFram
         .agg(pl.col("node_handle").mode().first())
     )
     return (
-        timers.join(alone, on="pid", how="left")
+        timers.join(only_nodes, on="pid", how="left")
         .join(publishing, on=_CALLBACK, how="left")
-        .select("pid", "timer_handle", node_handle=pl.coalesce("alone", "node_handle"))
+        .select("pid", "timer_handle", node_handle=pl.coalesce("only_node", "node_handle"))
         .drop_nulls("node_handle")
     )

@@ -1,23 +1,28 @@
-"""The trace points of `libtracetools.so`: where they are, the script that prints them, the tables.
+"""Write the script by which bpftrace prints the events of `libtracetools.so`, and read its output.
 
 Every ROS 2 build with tracing compiled in calls `ros_trace_<event>(arguments…)` of that library;
-:attr:`TracePoint.arguments` says with what. bpftrace sets uprobes there, and prints lines of
-numbers, separated by tabs and in no order:
+:attr:`TracePoint.arguments` says with which arguments. bpftrace sets uprobes there, and prints
+lines of numbers, separated by tabs and in no order:
 
     code  time  pid  tid  cpu  value 0 … value 9  [prev_comm  next_comm]
 
-* The code says which of the trace points it is, :data:`FIRST_POINT` being the first one.
-* Each value stands at its argument's place, a gid at two: its first 16 bytes, the others are zeros.
-* A text is printed as the aligned eight-byte words it lies in, in lines of its own
-  (:data:`TEXT_CODE`): 16 × the argument's place + the line's number, how many bytes before the text
-  the first word begins, and eight words. So a name may contain anything, unlike with `str()`.
-* `sched_switch` (:data:`SWITCH_CODE`) is printed where a thread that has emitted events goes or
-  comes; before its first one stands a line that says nothing of who went.
+* The code says which of the trace points it is; :data:`FIRST_POINT` is the code of the first one.
+* Each value stands at its argument's place. A gid stands at two places, which have its first 16
+  bytes; its other bytes are zeros.
+* A text is printed as the aligned words of eight bytes that it lies in, in lines of
+  :data:`TEXT_CODE`. Their values are: 16 × the argument's place + the number of the line; how many
+  bytes before the text the first word begins; and eight words. So a name may contain any character,
+  unlike with bpftrace's `str()`.
+* A `sched_switch` (:data:`SWITCH_CODE`) is printed when a thread that has emitted events starts or
+  stops running. At a thread's first event such a line is printed, too: it says that the thread
+  runs, and nothing of the thread before it.
 
 The handles of `rmw_publish` and `rmw_take` are the addresses of structures that begin with the
-addresses of the RMW's name, of its data and of the topic's name. Before tracetools 8 the former is
-found from `rcl_publish`'s `rcl_publisher_t`. bpftrace runs as root, so nothing stands in its script
-that a stranger may have written: events, which we know, numbers, and paths of plain characters.
+addresses of the RMW's name, of its data and of the topic's name. Before tracetools 8 `rmw_publish`
+has no handle; there it is read from the `rcl_publisher_t` of `rcl_publish`.
+
+bpftrace runs as root, so the script contains nothing that a stranger may have written: only events,
+which we know, numbers, and paths of plain characters.
 
 Upstream: `tracetools/tracetools.h` of ros2_tracing, tags 4.1.1 to 8.10.1; bpftrace 0.17 to 0.26;
 rmw, `rmw/types.h`; rcl, `publisher_impl.h` (Humble, Iron).
@@ -45,15 +50,15 @@ _SCHEMA: dict[str, pl.DataType] = {
     **dict.fromkeys(("prev_comm", "next_comm"), pl.String()),
 }
 HEADER = "\t".join(_SCHEMA) + "\n"
-"""What the file begins with that bpftrace prints into: lines may have fewer columns, not more."""
+"""The first line of the file that bpftrace prints into: lines may have fewer columns, not more."""
 
 TEXT_CODE, SWITCH_CODE, FIRST_POINT = 0, 1, 2
 TEXT_LINES = 8
 """Lines that one text may take, of 64 bytes each."""
 TEXT_BYTES = 64 * TEXT_LINES - 8
-"""What is printed of a text at least."""
+"""A text of so many bytes is printed whole; of a longer one only the beginning."""
 NAME_PLACE, RMW_PLACE = 8, 9
-"""Places, beyond any argument's, of the topic's and the RMW's name of a handle."""
+"""Places of the topic's name and the RMW's name of a handle, beyond those of arguments."""
 
 _PLAIN = re.compile(r"[A-Za-z0-9/._+ -]+")
 _TOPIC_NAME_AT = 16  # in rmw_publisher_t and rmw_subscription_t, on 64-bit machines
@@ -70,21 +75,24 @@ _SWITCH = {  # column of `sched_switch` → the kernel's name, in the order of p
 
 @dataclass(frozen=True)
 class TracePoint:
-    """One event's function in one library, which is traced as ``file``."""
+    """The function of an event in a library."""
 
     event: str
-    file: Path
+    file: Path  # by which bpftrace opens the library
     tracing_library: TracingLibrary
 
     @property
     def arguments(self) -> tuple[tuple[EventField, int], ...]:
-        """The fields that are arguments of the function, and which arguments, from 0."""
+        """The fields that are arguments of the function, with the number of each, from 0."""
         fields = EVENTS[self.event].fields_of_version(self.tracing_library.major)
         return tuple((field, field.argument) for field in fields if field.argument is not None)
 
     @property
     def handle(self) -> str | None:
-        """The address of the `rmw_publisher_t` or `rmw_subscription_t` that the event is about."""
+        """The address of the event's `rmw_publisher_t` or `rmw_subscription_t`, as bpftrace has it.
+
+        None: the event has none.
+        """
         at_rmw = self.tracing_library.handles_at_rmw
         if self.event == "rmw_take" or (self.event == "rmw_publish" and at_rmw):
             return "arg0"
@@ -95,7 +103,7 @@ class TracePoint:
 
 
 def trace_points(libraries: Sequence[TracingLibrary]) -> tuple[TracePoint, ...]:
-    """All trace points that the libraries export and a table is for, in the tables' order."""
+    """Return the trace points that the libraries export and that have a table, in their order."""
     return tuple(
         TracePoint(event, library.path, library)
         for event in events.FIELDS
@@ -111,19 +119,25 @@ def bpftrace_script(
     users: Collection[int] = (),
     attached: bool = False,
 ) -> str:
-    """The script for some trace points.
+    """Return the script that prints the events of some trace points.
 
-    Events are limited to the ``traced`` processes and all that they start, else to those of
-    ``users``; empty: to none. ``attached``: names of handles that were created before are read.
-    Raises InputError: a file's path is not of plain characters.
+    Events are limited to the ``traced`` processes and all that they start, or, if there are none,
+    to processes of ``users``, if there are any. ``attached``: the application runs already, so
+    names of handles are read from its memory.
+    Raises InputError: a file's path has other than plain characters.
     """
     limits = [f"@traced[{pid}] = 1;" for pid in traced]
-    theirs = " || ".join(f"uid == {user}" for user in sorted(users))
-    restriction = " /@traced[pid]/" if limits else f" /{theirs}/" if theirs else ""
+    of_users = " || ".join(f"uid == {user}" for user in sorted(users))
+    restriction = ""
+    if limits:
+        restriction = " /@traced[pid]/"
+    elif of_users:
+        restriction = f" /{of_users}/"
     maps, probes = ["@running"], dict[str, Iterable[str]]()
     if limits:
         maps.append("@traced")
-        # `pid` is the parent here; a new thread's number is no process's, and does no harm.
+        # Here `pid` is the parent's. The child may be a thread: its number is then no process's,
+        # and does no harm in the map.
         fork = "tracepoint:sched:sched_process_fork /@traced[pid]/"
         probes |= {"BEGIN": limits, fork: ["@traced[args->child_pid] = 1;"]}
     for code, point in enumerate(points, FIRST_POINT):
@@ -147,9 +161,10 @@ def bpftrace_script(
 
 
 def _statements(point: TracePoint, code: int, attached: bool) -> Iterator[str]:
+    """Yield the statements of a trace point's probe."""
     yield "$now = nsecs;"
-    came = _printf(SWITCH_CODE, ["tid"], "\\t" * 4 + "%d")
-    yield f"if (@running[tid] == 0) {{ @running[tid] = 1; {came} }}"
+    first_run = _printf(SWITCH_CODE, ["tid"], "\\t" * 4 + "%d")
+    yield f"if (@running[tid] == 0) {{ @running[tid] = 1; {first_run} }}"
     values: dict[int, str] = {}
     for field, place in point.arguments:
         if field.kind == "gid":
@@ -170,15 +185,21 @@ def _statements(point: TracePoint, code: int, attached: bool) -> Iterator[str]:
 
 
 def _printf(code: int, values: Sequence[str], template: str = "", now: str = "$now") -> str:
-    """Print a line of values, which are numbers unless a ``template`` says otherwise."""
+    """Return the statement that prints a line of values.
+
+    They are numbers unless a ``template`` says otherwise.
+    """
     columns = template or "\\t%lld" * len(values)
     arguments = ", ".join((now, "pid", "tid", "cpu", *values))
     return f'printf("{code}\\t%lld\\t%d\\t%d\\t%d{columns}\\n", {arguments});'
 
 
 def _text(address: str, place: int) -> Iterator[str]:
-    """Print the words of a text until one that ends with a null byte, or for long enough."""
-    words = [f"*(uint64 *)($word + {at})" for at in range(0, 64, 8)]
+    """Yield the statements that print a text: lines of words up to one that ends in a zero byte.
+
+    A text that does not end so within :data:`TEXT_LINES` lines is cut.
+    """
+    words = [f"*(uint64 *)($word + {offset})" for offset in range(0, 64, 8)]
     yield f"$text = {address};"
     yield "$word = $text & ~7;"
     yield "$line = 0;"
@@ -191,20 +212,22 @@ def _text(address: str, place: int) -> Iterator[str]:
 
 
 class Printed(NamedTuple):
-    """The output of one run. ``cut_names``: how many were longer than what is printed.
+    """The output of a run of the script.
 
-    ``handles`` are the names of handles that were in use when tracing began, ``pid, event, handle,
-    topic``; ``rmw`` is from such a one.
+    ``handles`` are those that events had, if the application ran before tracing began:
+
+    * ``pid``, ``event``, ``handle``
+    * ``topic``: the name in the handle's memory
     """
 
     tables: dict[str, pl.DataFrame]
     handles: pl.DataFrame
-    rmw: str | None
-    cut_names: int
+    rmw: str | None  # the RMW's name, in the memory of a handle
+    cut_names: int  # so many names were longer than what is printed
 
 
 def read_printed(path: Path, points: Sequence[TracePoint], ahead_ns: int) -> Printed:
-    """Read what the script of these trace points printed, behind :data:`HEADER`.
+    """Read what the script of these trace points printed into a file that begins with HEADER.
 
     ``ahead_ns`` is CLOCK_BOOTTIME, which bpftrace reads, minus CLOCK_MONOTONIC.
     """
@@ -215,7 +238,7 @@ def read_printed(path: Path, points: Sequence[TracePoint], ahead_ns: int) -> Pri
         stream.seek(-1, 2)
         if stream.read() != b"\n":  # bpftrace was killed while it wrote
             lines = lines.head(-1)
-    # bpftrace's own lines have no number in front.
+    # Messages of bpftrace itself have no number in front.
     lines = lines.drop_nulls(CODE).with_columns(pl.col("time") - ahead_ns)
     texts = _texts(lines.filter(code=TEXT_CODE))
     parts: dict[str, list[pl.DataFrame]] = {}
@@ -223,9 +246,10 @@ def read_printed(path: Path, points: Sequence[TracePoint], ahead_ns: int) -> Pri
         rows = lines.filter(code=code)
         if rows.height:
 
-            def said(place: int, rows: pl.DataFrame = rows) -> pl.Series:
-                own = texts.filter(place=place)
-                return rows.join(own, on=["time", "tid"], how="left", maintain_order="left")["text"]
+            def texts_at(place: int, rows: pl.DataFrame = rows) -> pl.Series:
+                at_place = texts.filter(place=place)
+                key = ["time", "tid"]
+                return rows.join(at_place, on=key, how="left", maintain_order="left")["text"]
 
             values = rows.select(VALUES).fill_null(0).to_numpy().view(np.uint64)
             table = table_of_registers(
@@ -233,7 +257,7 @@ def read_printed(path: Path, points: Sequence[TracePoint], ahead_ns: int) -> Pri
                 point.arguments,
                 rows.select(CODE[1:]),
                 values,
-                said,
+                texts_at,
                 version=point.tracing_library.version,
             )
             parts.setdefault(point.event, []).append(table)
@@ -260,22 +284,30 @@ def read_printed(path: Path, points: Sequence[TracePoint], ahead_ns: int) -> Pri
 
 
 def _texts(lines: pl.DataFrame) -> pl.DataFrame:
-    """``time, tid, place, text, cut``: the texts, put together from their words."""
+    """Put texts together from the lines of their words; leave out those whose beginning was lost.
+
+    Columns:
+
+    * ``time``, ``tid``: of the event that has the text
+    * ``place``: of the argument
+    * ``text``
+    * ``cut``: whether its end was not printed
+    """
     key = ["time", "tid", "place", "line"]
     lines = lines.with_columns(place=pl.col(VALUES[0]) // 16, line=pl.col(VALUES[0]) % 16)
     lines = lines.sort(key)
     words = lines.select(VALUES[2:]).fill_null(0).to_numpy().astype("<i8")
     parts: dict[tuple[int, ...], bytes] = {}
     rows = lines.select(*key, VALUES[1]).iter_rows()
-    for part, (*where, line, skipped) in zip(words, rows, strict=True):
-        thread = tuple(where)
-        before = parts.get(thread, b"")
-        here = line * part.nbytes - (skipped if line else 0)
-        if b"\0" not in before and here == len(before):  # else it has ended, or a line was lost
-            parts[thread] = before + part.tobytes()[0 if line else skipped :]
-    texts = ((thread, *part.partition(b"\0")) for thread, part in parts.items())
+    for part, (*key_values, line, skipped) in zip(words, rows, strict=True):
+        text_key = tuple(key_values)
+        before = parts.get(text_key, b"")
+        offset = line * part.nbytes - (skipped if line else 0)
+        if b"\0" not in before and offset == len(before):  # else it has ended, or a line was lost
+            parts[text_key] = before + part.tobytes()[0 if line else skipped :]
+    texts = ((text_key, *part.partition(b"\0")) for text_key, part in parts.items())
     return pl.DataFrame(
-        [(*thread, text_of(text), not end) for thread, text, end, _ in texts],
+        [(*text_key, text_of(text), not end) for text_key, text, end, _ in texts],
         schema={**dict.fromkeys(key[:3], pl.Int64), "text": pl.String, "cut": pl.Boolean},
         orient="row",
     )

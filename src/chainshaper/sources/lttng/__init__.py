@@ -1,14 +1,16 @@
-"""Tracing with LTTng: a recording session of our own, and the session daemon that it needs.
+"""Tracing with LTTng: our recording session, and the session daemon that it needs.
 
-A root daemon that runs already, which we may use as root or in the group `tracing`, traces
-everybody's processes, and the kernel: we add a session to it, and leave out of the tables what
-other applications did. Otherwise we start a daemon that listens in a home directory of our own, the
-command's `LTTNG_HOME`, so it traces the command alone. Root's run directory is always
-/var/run/lttng, so root's daemon and clients have one of ours mounted there, in mount namespaces of
-their own. Where root may not mount, there can be one recording at a time.
+If root's session daemon runs already, and we may use it (as root, or in the group `tracing`), we
+add a session to it. That daemon traces the processes of all users, and the kernel, so we leave
+other applications' events out of the tables.
 
-If we are killed, the kernel ends a daemon of ours; a shell that waits for our end destroys our
-sessions in another's daemon and removes the home directory.
+Otherwise we start a daemon. It listens in a new home directory, which is the command's
+`LTTNG_HOME`, so it traces the command alone. Root's run directory is always /var/run/lttng; so for
+a daemon of root, and its clients, another directory is mounted there, in mount namespaces of their
+own. Where root may not mount, there can be a single recording at a time.
+
+If we are killed, the kernel ends the daemon that we have started. A shell that waits for our end
+destroys our sessions in root's daemon, and removes the home directory.
 
 Upstream: lttng(1), lttng-sessiond(8), lttng-enable-channel(1); lttng-tools, `utils_get_rundir`;
 lttng-ust, `setup_local_apps`; `tracetools_trace` of ros2_tracing.
@@ -43,7 +45,7 @@ from chainshaper.values.recording import RecordingInfo
 EVENTS = "ros2:*,ros2_caret:*,dds:*"
 """Everything that `tracetools` of any distribution, CARET, and a traced Cyclone DDS emit."""
 MARK = "CHAINSHAPER_RECORDING"
-"""In the environment of the command, and of everything that it starts."""
+"""A variable of the command and of all that it starts, by which we recognise its processes."""
 
 MIB = 1 << 20
 DEFAULT_BUFFER = 4 * MIB
@@ -74,7 +76,7 @@ class LttngSession:
     """Records with LTTng: a :class:`~chainshaper.sources.Tracer`.
 
     * ``buffer``: the size of the ring buffer of each core in bytes (:func:`buffer_size`).
-    * ``home``: a directory of our own, after whose unique name sessions are called.
+    * ``home``: a new directory; names of sessions begin with its unique name.
     * ``daemon``: the session daemon, where we have started it.
     """
 
@@ -158,7 +160,7 @@ class LttngSession:
     def stop(self) -> None:
         """Stop the session; LTTng waits until its buffers are on disk.
 
-        What is there already stays of use where that fails, so it is noted.
+        If that fails, a note says so: the events on disk can be used anyway.
         """
         if self._sessions:
             self._look_for_strangers()
@@ -315,7 +317,10 @@ class LttngSession:
         return name
 
     def _enlarge(self) -> None:
-        """Go on in a session with larger buffers, if there is room: one that runs gets none."""
+        """Go on in a new session with larger buffers, if there is room.
+
+        Buffers of a session that runs cannot become larger.
+        """
         before, larger = self._buffer, buffer_size(wanted=self._buffer * _ENLARGED_BY)
         if larger <= before:
             return
@@ -323,7 +328,7 @@ class LttngSession:
         try:
             successor = self._new_session()
         except OperationError:
-            self._sessions.sort(key=former.__eq__)  # the last one is that which runs
+            self._sessions.sort(key=former.__eq__)  # the last one is the session that runs
             raise
         stopped = time.monotonic_ns()
         self._ask("stop", former, "--no-wait")
@@ -369,22 +374,22 @@ def _is_marked(pid: int, mark: str, users: Collection[int]) -> bool:
 def _without_processes(
     strangers: Collection[int], tables: EventTables, info: RecordingInfo
 ) -> tuple[EventTables, RecordingInfo]:
-    """Leave out of tables and their description what processes of others did."""
+    """Leave processes that are not the command's out of the tables and their description."""
     traced = (frame["pid"].drop_nulls().unique() for frame in tables.values())
     foreign = sorted({pid for pids in traced for pid in pids} & set(strangers))
     if not foreign:
         return tables, info
     is_ours = ~pl.col("pid").is_in(foreign).fill_null(False)
-    left = {name: frame.filter(is_ours) for name, frame in tables.items()}
+    remaining = {name: frame.filter(is_ours) for name, frame in tables.items()}
     names = ", ".join(f"{pid} {info.processes.get(pid, '')}".strip() for pid in foreign)
     note = f"processes that the command has not started are left out: {names}."
     counts = {
         name if name == "sched_switch" else f"ros2:{name}": frame.height
-        for name, frame in left.items()
+        for name, frame in remaining.items()
     }
     facts = {
         "processes": {pid: name for pid, name in info.processes.items() if pid not in foreign},
         "notes": (*info.notes, note),
         "trace_events": counts,
     }
-    return left, info.model_copy(update=facts)
+    return remaining, info.model_copy(update=facts)

@@ -1,9 +1,9 @@
-"""Which folders of a trace belong together, and which hold the same events.
+"""Find out which folders of a trace belong together, and which have the same events.
 
-A session that is rotated writes a folder for each chunk, and one with a snapshot for the start of
-the application beside it writes two: they are one trace. Containers number their processes alike,
-and their folders have to stay apart. Two sessions that recorded the same processes have every event
-twice, at slightly different times.
+A session that is rotated writes a folder for each chunk; a session with a snapshot of the
+application's start writes two folders. In both cases the folders are one trace. Processes in
+different containers may have the same numbers, so folders of containers must be kept apart. Two
+sessions that recorded the same processes have every event twice, at slightly different times.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -20,11 +20,11 @@ from chainshaper.values import events
 from chainshaper.values.errors import InputError
 
 CARET_INIT = "caret_init"
-"""An event of CARET's that is read with the creation, but is no table of ours."""
+"""An event of CARET that is read with the events of creation; it has no event table."""
 Place: TypeAlias = tuple[str, str | Path]
 """A host's name, and the path that was given."""
 _SAME_NS = 100_000
-"""So far apart two sessions note the same event, at most."""
+"""Two sessions record the same event at times that differ by no more than this."""
 _REGISTERED = (
     "rclcpp_callback_register",
     "rclcpp_timer_callback_added",
@@ -95,7 +95,7 @@ def _overlap(left: _Span, right: _Span) -> bool:
 def _spans_of_streams(
     trace: CtfTrace, folders: Sequence[int]
 ) -> dict[tuple[str | None, str, int], _Span]:
-    """Return trace's UUID, domain and stream's instance → when the stream runs."""
+    """Return (UUID of the trace, its domain, instance of the stream) → when the stream runs."""
     spans: dict[tuple[str | None, str, int], _Span] = {}
     for stream in trace.streams:
         if stream.folder in folders:
@@ -137,9 +137,11 @@ def _objects(trace: CtfTrace, folders: Sequence[int]) -> _Objects:
 
 
 def _shares_creation(left: _Objects, right: _Objects) -> bool:
-    """Return whether most of what runs without being created in its folders was created in others.
+    """Return whether two sets of folders are of one application.
 
-    CARET writes the creation again in each session, with the time at which it was.
+    They are if most callbacks that run in one of them, but are not created there, are created in
+    the other; or if both have the creation of the same node, since CARET writes the creation
+    again in each session, with the time at which it really was.
     """
     if left.nodes & right.nodes:
         return True
@@ -152,7 +154,7 @@ def _shares_creation(left: _Objects, right: _Objects) -> bool:
 
 
 def refuse_same_events(trace: CtfTrace) -> None:
-    """Refuse a trace that has two folders with the same events. Raises InputError: names them."""
+    """Raise InputError for a trace with two folders that have the same events; it names them."""
     times = {number: _time_of(trace, number) for number in range(len(trace.folders))}
     suspected = [
         (left, right)
@@ -185,7 +187,7 @@ def _of_same_system(trace: CtfTrace, left: int, right: int) -> bool:
 
 
 def _time_of(trace: CtfTrace, folder: int) -> _Span:
-    """Return from when to when a folder has packets; for ever, where they do not say so."""
+    """Return from when to when a folder has packets; always, if packets do not say a time."""
     packets = [stream.packets for stream in trace.streams if stream.folder == folder]
     if not packets:
         return 0, 0
@@ -206,7 +208,7 @@ def _events_of(
 
 
 def _keyed(frame: pl.DataFrame) -> pl.DataFrame:
-    """Return the times of events, and a number of each that tells it from others of its name."""
+    """Return times, processes and keys of events; a key is a hash of the event's fields."""
     simple = [
         name
         for name, kind in frame.schema.items()
@@ -216,7 +218,10 @@ def _keyed(frame: pl.DataFrame) -> pl.DataFrame:
 
 
 def _same(left: Mapping[str, pl.DataFrame], right: Mapping[str, pl.DataFrame]) -> bool:
-    """Return whether of each kind of event most of those in the common time are in both."""
+    """Return whether both sides have the same events.
+
+    That is so if, for each kind of event, most events within the common time are on both sides.
+    """
     shares = []
     for name in left.keys() & right.keys():
         begin = max(int(side[name]["time"][0]) for side in (left, right)) - _SAME_NS

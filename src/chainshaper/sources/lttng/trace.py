@@ -1,15 +1,20 @@
 """LTTng traces as recordings: the folders that `ros2 trace` writes.
 
 Events lose their provider (``ros2:callback_start`` → ``callback_start``) and get the columns and
-types of :mod:`chainshaper.values.events`. A field that a trace does not declare, or of a kind that
-no cast brings right, becomes a column of nulls; a note says so unless a distribution is like that.
+types of :mod:`chainshaper.values.events`. A field that a trace does not declare, or declares with a
+type that cannot be cast, becomes a column of nulls; a note says so, unless this is usual in some
+distribution.
 
-Tables are decoded in groups that are used together: a pass over a trace costs nearly the same for
-one table as for twenty. Containers number their processes independently: folders of several hosts
-are read host by host, and of one host (`--network host` has its name) path by path, but for paths
-of one session; where two use the same number, the later one's are moved (:data:`NEXT_HOST`). CARET
-emits the events of an application's start again when tracing begins; ``init_timestamp`` says when
-they really happened.
+Tables are decoded in groups that are used together, since a pass over a trace costs nearly the same
+for a single table as for twenty.
+
+Processes in different containers may have the same numbers. So folders of different hosts are read
+host by host; and folders of the same host path by path, unless the paths are of the same session,
+since containers with `--network host` have the host's name. Where two hosts have the same numbers,
+those of the later host are moved (:data:`NEXT_HOST`).
+
+CARET emits the events of an application's start again when tracing begins; ``init_timestamp`` says
+when they really happened.
 """
 
 from collections import Counter
@@ -98,11 +103,11 @@ def _fact(folder: ctf.TraceClass, name: str) -> str:
 
 
 class TraceTables(Mapping[str, pl.DataFrame]):
-    """The event tables of an open trace that happened, decoded at first use.
+    """The event tables of a trace, decoded when they are first used. It has no empty tables.
 
     * ``counts``: events per full name, provider included.
     * ``fields``: table → the fields that are declared for its event.
-    * ``damaged``: so many packets are damaged.
+    * ``damaged``: the number of damaged packets.
     """
 
     def __init__(self, hosts: Mapping[str, CtfTrace], progress: Progress) -> None:
@@ -121,7 +126,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         self._anonymous = 0
         self._pids: set[int] = set()
         self._moved: dict[str, int] = {}
-        # Where numbers may collide, those of all hosts have to be seen first.
+        # Whether numbers of processes have to be moved is known when those of all hosts are.
         self._decode(CREATION | {CARET_INIT} | _MESSAGES)
 
     def creation(self) -> events.EventTables:
@@ -133,7 +138,10 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         }
 
     def commands(self) -> dict[int, str]:
-        """Return process → its main thread's name, of all that created objects, or else ran."""
+        """Return process → its main thread's name, of processes that created objects.
+
+        If no creation was traced, of those that ran.
+        """
         tables = [self._read[name] for name in CREATION if name in self._read]
         if not any(self._counted(name) for name in ("rcl_node_init", "rcl_init")):
             tables += [self[name] for name in _WHO_RUNS if name in self]
@@ -179,7 +187,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         return sum(self.counts[source] for source in self._sources.get(name, ()))
 
     def notes(self) -> Iterator[str]:
-        """Yield what a reader of the tables must know: damage, absent fields, moved numbers."""
+        """Yield notes on the tables: damage, absent fields, moved numbers."""
         yield from self.warnings
         for name in sorted(set(self) & self.fields.keys()):
             missing = [
@@ -204,7 +212,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
             )
 
     def _decode(self, group: frozenset[str]) -> None:
-        """Decode the tables of a group, host by host; at the first time, count all events."""
+        """Decode the tables of a group, host by host; the first call counts all events, too."""
         parts: dict[str, list[pl.DataFrame]] = {}
         wanted = [full for name in group for full in self._sources.get(name, ())]
         nameless = [full for full in wanted if table_name(full) not in CREATION]
@@ -222,7 +230,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
                 self._note_names(host, trace, frames)
             for name in group:
                 for full in self._sources.get(name, ()):
-                    decoded = frames.pop(full)  # let go of what is in no table
+                    decoded = frames.pop(full)  # so that its memory is free after this turn
                     table = _event_table(decoded, name, trace.clock_offset_ns)
                     if first:
                         self._anonymous += decoded.height - table.height
@@ -231,13 +239,13 @@ class TraceTables(Mapping[str, pl.DataFrame]):
                     parts.setdefault(name, []).append(table)
         for name, tables in parts.items():
             table = tables[0]
-            if len(tables) > 1:  # several providers'; CARET's copy of an event is not another
+            if len(tables) > 1:  # of several providers; CARET emits copies of events
                 table = pl.concat(tables, how="diagonal_relaxed").sort("time", maintain_order=True)
                 table = table.unique(maintain_order=True) if table.height else table
             self._read[name] = table
 
     def _take_stock(self, host: str, frames: Events) -> None:
-        """Count all events; move numbers that another host has, too."""
+        """Count all events; find out whether numbers of this host's processes have to be moved."""
         self.counts.update(frames.counts)
         self.warnings += frames.warnings
         self.damaged += frames.damaged
@@ -250,7 +258,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
             self._pids |= pids
 
     def _note_names(self, host: str, trace: CtfTrace, frames: Events) -> None:
-        """Note what processes are called, by their objects' creation if it was traced."""
+        """Store the names of processes: from the events of creation, else from those of running."""
         names = _process_names(frames)
         if not names and not any(name in self for name in CREATION):
             ran = [full for name in _WHO_RUNS for full in self._sources.get(name, ())]
@@ -259,7 +267,10 @@ class TraceTables(Mapping[str, pl.DataFrame]):
 
 
 def _by_host(trace: CtfTrace, paths: Sequence[str | Path]) -> dict[str, CtfTrace]:
-    """Return the trace in parts, by traced host, or path of one; the first has foreign kernels'."""
+    """Split the trace by host, or by path where a host has several sessions.
+
+    Streams of a kernel whose host has no traced processes go to the first part.
+    """
     of_kernel = [folder.env.get("domain") == "kernel" for folder in trace.folders]
     places: list[Place] = [
         (_fact(folder, "hostname"), next(p for p in paths if folder.path.is_relative_to(p)))
@@ -323,7 +334,7 @@ def _decoded_type(declared: ctf.Type | None) -> pl.DataType | None:
 
 
 def _event_table(frame: pl.DataFrame, name: str, clock_offset_ns: int) -> pl.DataFrame:
-    """Return a decoded event's frame as an event table, without events of no known thread."""
+    """Return a decoded event's frame as an event table; events without a thread are left out."""
     if "init_timestamp" in frame.columns and frame.schema["init_timestamp"].is_integer():
         happened = pl.col("init_timestamp")
         wall_clock = happened > clock_offset_ns

@@ -12,7 +12,7 @@ from pathlib import Path
 from chainshaper.values.event_declarations import Event, FieldKind, events_of_library
 
 _LAYOUT = 3
-"""Goes up when the memory of a traced process changes in another way than by its events."""
+"""To be increased when the memory of a traced process changes otherwise than by its events."""
 
 _TEMPLATE = """\
 // Made by sources/preload/events_header.py from values/event_declarations.py.
@@ -25,7 +25,7 @@ _TEMPLATE = """\
 
 
 def event_line(event: Event) -> str:
-    """An event in the list of `preload.c`."""
+    """Return the line of an event in the list of `preload.c`."""
     if event.recorded_by_library == "service call":
         return f"CALL({event.name})"
     if event.group == "creation":
@@ -38,7 +38,7 @@ def event_line(event: Event) -> str:
 
 
 def _places(event: Event, kind: FieldKind | None = None) -> list[int]:
-    """The places of the arguments of an event that are of a kind, or of any."""
+    """Return the places of an event's arguments that are of a kind; None: of any kind."""
     return [
         field.argument
         for field in event.fields
@@ -47,12 +47,12 @@ def _places(event: Event, kind: FieldKind | None = None) -> list[int]:
 
 
 def events_header(events: Iterable[Event]) -> str:
-    """The text of `events.h`, but for its format's number."""
+    """Return the text of `events.h`, without the number of its format."""
     return _TEMPLATE.format(lines=" \\\n  ".join(map(event_line, events)))
 
 
 def format_of(header: str) -> int:
-    """A number of 32 bits that says which events a memory has, and how it is laid out."""
+    """Return a number of 32 bits that stands for the events of a memory and its layout."""
     return zlib.crc32(header.encode(), _LAYOUT)
 
 

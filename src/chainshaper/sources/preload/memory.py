@@ -1,8 +1,8 @@
 """The memory of a traced process, and how it is read while the process writes it.
 
-`preload.c` writes it. A process writes into its memory whatever it likes, by a mistake as well. So
-every record is checked before it is used; the first that the library cannot have written is the
-last that is looked at of that process, whose events from there on are counted as lost.
+`preload.c` writes the memory, but any code of the process may write into it, for instance by
+mistake. So every record is checked before it is used. At the first record that the library cannot
+have written, reading of this process ends: its events from there on are counted as lost.
 """
 
 import fcntl
@@ -137,7 +137,7 @@ class TracedProcess:
         self.pid = pid or self.inner_pid
         if not (0 < self.pid <= _LARGEST_ID and 0 < self.inner_pid <= _LARGEST_ID):
             raise InputError(f"what was sent says that it is of process {self.inner_pid}")
-        clock = int(header["clock"][0])  # what it said counts, for it may have ended since
+        clock = int(header["clock"][0])  # the process itself may have ended since
         if clock not in (0, time_namespace()) or (not clock and of_another_clock(self.pid)):
             raise RefusedMemoryError(
                 "it has another clock, that of a time namespace: record it in there"
@@ -180,7 +180,7 @@ class TracedProcess:
             oldest = max(read, written - ring.size)
             places = np.arange(oldest, written) % ring.size
             copied = ring.take(places)
-            # The record behind `written` may be half there, in the place of the oldest of all.
+            # The process may be writing the next record, which takes the place of the oldest one.
             whole = max(oldest, int(self._rings["written"][number]) + 1 - ring.size)
             self.lost += min(whole, written) - read
             self._read[number] = written

@@ -1,32 +1,39 @@
-// The tracer in front of ROS 2: `LD_PRELOAD` loads it into a node, where it stands before
-// libtracetools. Each of a library's calls of `ros_trace_<event>(…)` becomes a record in shared
-// memory, then goes on to the function behind, so that LTTng and uprobes go on working.
+// The tracer in front of ROS 2: `LD_PRELOAD` loads it into a node, in front of libtracetools. A call
+// of `ros_trace_<event>(…)` arrives here first: it is recorded in shared memory, then passed on to
+// the function behind ours, so that LTTng and uprobes go on working.
 //
-// The memory is a memfd: it is gone with its last process, whoever is killed. Its name shows it to
-// who attaches to a running node; where CHAINSHAPER_TRACE names a socket, it is sent there at once.
+// The memory is a memfd: the kernel frees it when the last process that has it ends, however that
+// happens. A recorder that attaches to a running node finds it by its name. Where CHAINSHAPER_TRACE
+// names a socket, the memory is sent there as soon as it is made.
 //
 //     header | objects, appended by all threads | ring of thread 0 | ring of thread 1 | …
 //
-// * Events of creation, which say what all others are about, are appended to the objects, and stay.
-// * All other events go to the ring of their thread, over its oldest. A thread takes a ring at its
-//   first event, and gives it back as it ends. `written` counts: who reads sees what it has missed.
-// * Nothing waits, nothing is allocated behind a thread's first event. What finds no room is counted.
+// * Events of creation, which say what handles in other events are, are appended to the objects, and
+//   are never overwritten.
+// * All other events go to the ring of their thread, in place of its oldest record. A thread takes a
+//   ring at its first event, and gives it back when it ends. `written` counts the records, so a reader
+//   sees how many were overwritten before it read them.
+// * No thread waits, and no memory is allocated after a thread's first event. Events without room are
+//   counted as dropped.
 //
 // We are a guest in the robot's process: whatever fails here, the node goes on as without us.
 //
-// * A thread never waits for another: where two make the memory at once, the second one's is thrown
-//   away. (Waiting would stop a SCHED_FIFO thread, and with it the ordinary one that it waits for.)
+// * A thread never waits for another: where two threads make the memory at once, the second memory is
+//   thrown away. (A waiting SCHED_FIFO thread could keep the core from the ordinary thread that it
+//   waits for.)
 // * Memory is claimed before it is written: where the kernel has none left, a write would be a SIGBUS.
-// * A limit on file sizes (`ulimit -f`) would send SIGXFSZ for our memory: it is blocked meanwhile.
-// * A child of fork() has a memory of its own, or none, however it was made; and a descriptor is closed
-//   only while it is still ours, since a node may close all numbers and use them again.
+// * A limit on file sizes (`ulimit -f`) would send SIGXFSZ when our memory is made: the signal is
+//   blocked meanwhile.
+// * A child process has a memory of its own, or none, whichever system call made it. A descriptor
+//   is closed only while it is still that of our file, since a node may close all descriptors and
+//   use their numbers again.
 //
-// Times are ns of CLOCK_MONOTONIC, values a function's arguments as they are in registers (of a bool
-// the lowest byte counts). Calls of services have trace points from Kilted on only: we see them as
-// librcl calls rmw.
+// Times are ns of CLOCK_MONOTONIC. Values are a function's arguments as they are in registers (of a
+// bool only the lowest byte counts). Calls of services have trace points from Kilted on only; so we
+// record them where librcl calls rmw.
 //
 // Upstream: `tracetools/tracetools.h` of ros2_tracing, tags 4.1.1 to 8.10.1: all arguments are
-// integers or pointers, at most five, so that any of its versions can be called, and answered, alike.
+// integers or pointers, at most five, so functions of all versions can be called in the same way.
 // rmw, `rmw/types.h` and `rmw/rmw.h`, Humble to Rolling: `rmw_service_info_t`, `rmw_request_id_t`.
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -76,9 +83,9 @@ struct ring {
 
 struct memory {
   uint32_t magic, format, pid, rings, ring_records, object_records;
-  _Atomic uint64_t objects;  // records that were asked for: more than there are, when it is full
-  _Atomic uint64_t dropped;  // events that found no room
-  uint64_t clock;             // the time namespace whose CLOCK_MONOTONIC it is; 0: not known
+  _Atomic uint64_t objects;  // object records that threads have claimed; may exceed OBJECT_RECORDS
+  _Atomic uint64_t dropped;  // events for which there was no room
+  uint64_t clock;             // the time namespace whose CLOCK_MONOTONIC times are of; 0: not known
   uint64_t unused[2];
   struct ring ring[RINGS];
   struct record object[OBJECT_RECORDS];
@@ -92,9 +99,9 @@ static int descriptor = -1;
 static struct stat identity;  // of the file behind it
 static pthread_key_t at_end;
 static bool has_key;
-// A page that the kernel empties in a child of fork(): 1 while the memory is this process's own.
+// In a page that the kernel fills with zeros in a child process: 1 while `memory` is this process's.
 static volatile uint32_t *memory_is_ours = &(volatile uint32_t){1};
-struct rseq_area {  // struct rseq of <linux/rseq.h>, which older headers have not
+struct rseq_area {  // struct rseq of <linux/rseq.h>, which older systems do not have
   uint32_t cpu_id_start, cpu_id;
   volatile uint64_t section;
 };
@@ -108,11 +115,13 @@ static __thread struct {
   struct ring *ring;
   struct record *records;
   uint32_t tid;
-  struct rseq_area *rseq;             // NULL: a switch cannot be noticed
-  uint64_t used, used_at, last_used;  // CPU time as read, when that was, and as last written
-  bool calls_timer;
-  uint16_t latest;  // event
-} own;
+  struct rseq_area *rseq;  // NULL: we cannot see whether the thread has left its core
+  uint64_t used;           // CPU time, as read from the kernel
+  uint64_t used_at;        // when it was read
+  uint64_t last_used;      // CPU time in the latest record
+  bool calls_timer;        // it is in rcl_timer_call
+  uint16_t latest;         // event
+} thread;
 
 static inline uint64_t now(clockid_t clock) {
   struct timespec time;
@@ -120,13 +129,18 @@ static inline uint64_t now(clockid_t clock) {
   return (uint64_t)time.tv_sec * 1000000000u + (uint64_t)time.tv_nsec;
 }
 
-// CPU time of the thread, without a system call while it has been on its core since the last one:
-// then it has used what has passed. The kernel resets the thread's pointer to a restartable sequence
-// (rseq(2)) when it takes the core away outside of it, and ours is empty. The clock itself is read
-// again after SURELY_USED, so that interrupts and stolen time, which it leaves out, add up to no more.
-// A kernel need not reset the pointer of a thread that waits in a system call: one try in each
-// process finds that out. A reading that an interrupt separates from its instant (READ_AT_ONCE)
-// serves for one event only: what came between them would be missing from all that follow.
+// The CPU time of the thread, without a system call as long as the thread stays on its core: then the
+// time that has passed since the last system call is CPU time.
+//
+// Whether it has stayed shows a pointer of the thread to a restartable sequence (rseq(2)). The kernel
+// resets it when it takes the core away while the thread is outside of the sequence, and ours is
+// empty, so the thread is always outside. Some kernels do not reset the pointer of a thread that waits
+// in a system call: `find_rseq` tries this once in each process, and does without the pointer there.
+//
+// The kernel's clock leaves out interrupts and stolen time. It is read again after SURELY_USED, so
+// that no more than this is wrong. The clock and its instant are read one after the other; where an
+// interrupt separates them by more than READ_AT_ONCE, the pair serves for one event only, since the
+// error would be in all events that follow.
 #define SURELY_USED 200000u   // ns
 #define READ_AT_ONCE 4000u    // ns
 #if defined(__x86_64__)
@@ -139,18 +153,18 @@ static inline uint64_t now(clockid_t clock) {
 #define SIGNATURE 0u
 #define THREAD_POINTER(to) (to = NULL)
 #endif
-static const uint32_t nowhere[2] = {SIGNATURE};  // the kernel looks for it before an abort's address
+static const uint32_t nowhere[2] = {SIGNATURE};  // the kernel wants it in front of an abort's address
 static struct {
   uint32_t version, flags;
   uint64_t start, size, abort;
 } no_section __attribute__((aligned(32)));
-static _Atomic ptrdiff_t rseq_offset;  // from the thread's pointer; 0: without
+static _Atomic ptrdiff_t rseq_offset;  // of the area from the thread pointer; 0: do without it
 
 static struct rseq_area *rseq_at(ptrdiff_t offset) {
-  char *thread;
-  THREAD_POINTER(thread);
-  struct rseq_area *area = (struct rseq_area *)(void *)(thread + offset);
-  return thread && offset && (int32_t)area->cpu_id >= 0 ? area : NULL;
+  char *thread_pointer;
+  THREAD_POINTER(thread_pointer);
+  struct rseq_area *area = (struct rseq_area *)(void *)(thread_pointer + offset);
+  return thread_pointer && offset && (int32_t)area->cpu_id >= 0 ? area : NULL;
 }
 
 static void find_rseq(void) {
@@ -165,37 +179,37 @@ static void find_rseq(void) {
     nanosleep(&(struct timespec){0, 1}, NULL);
     if (rseq->section) usable = 0;
   }
-  rseq_offset = usable;  // at once: another thread may be here too, and finds the same
+  rseq_offset = usable;  // in one write: another thread may be here too, and comes to the same result
 }
 
 static uint64_t thread_time(uint64_t time) {
-  uint64_t used = own.used + (time - own.used_at);
-  bool stayed = own.rseq && own.rseq->section == (uintptr_t)&no_section;
-  if (!stayed || time - own.used_at >= SURELY_USED) {
+  uint64_t used = thread.used + (time - thread.used_at);
+  bool stayed = thread.rseq && thread.rseq->section == (uintptr_t)&no_section;
+  if (!stayed || time - thread.used_at >= SURELY_USED) {
     uint64_t before = now(CLOCK_MONOTONIC);
-    if (own.rseq) own.rseq->section = (uintptr_t)&no_section;
-    used = own.used = now(CLOCK_THREAD_CPUTIME_ID);
-    own.used_at = now(CLOCK_MONOTONIC);
-    if (own.rseq && own.used_at - before > READ_AT_ONCE) own.rseq->section = 0;
+    if (thread.rseq) thread.rseq->section = (uintptr_t)&no_section;
+    used = thread.used = now(CLOCK_THREAD_CPUTIME_ID);
+    thread.used_at = now(CLOCK_MONOTONIC);
+    if (thread.rseq && thread.used_at - before > READ_AT_ONCE) thread.rseq->section = 0;
   }
-  if (used > own.last_used) own.last_used = used;
-  return own.last_used;
+  if (used > thread.last_used) thread.last_used = used;
+  return thread.last_used;
 }
 
 static void stamp(struct record *record, uint64_t time) {
   record->time = time;
-  record->tid = own.tid;
+  record->tid = thread.tid;
   record->cpu = (uint16_t)sched_getcpu();
 }
 
-// Send the memory to who waits for it, if anyone does.
+// Send the memory to the recorder that listens on a socket, if there is one.
 static void send_memory(const char *name) {
   struct sockaddr_un address = {.sun_family = AF_UNIX};
   size_t length = strlen(name);
   int peer = socket(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC | SOCK_NONBLOCK, 0);
   if (peer < 0) return;
   if (length >= sizeof address.sun_path) length = sizeof address.sun_path - 1;  // nothing listens there
-  memcpy(address.sun_path + 1, name, length);  // in no file system: nothing of it is left behind
+  memcpy(address.sun_path + 1, name, length);  // an abstract name: it leaves no file behind
   socklen_t size = (socklen_t)(offsetof(struct sockaddr_un, sun_path) + 1 + length);
   if (connect(peer, (struct sockaddr *)&address, size) == 0) {
     union {
@@ -203,7 +217,7 @@ static void send_memory(const char *name) {
       char room[CMSG_SPACE(sizeof(int))];
     } control = {.header = {CMSG_LEN(sizeof(int)), SOL_SOCKET, SCM_RIGHTS}};
     memcpy(CMSG_DATA(&control.header), &descriptor, sizeof(int));
-    // Its program may have ended before the recorder looks at it, and is named all the same.
+    // The recorder gets the program's name, too: this process may have ended before it looks.
     char program[16] = "";
     prctl(PR_GET_NAME, program);
     struct iovec content = {.iov_base = program, .iov_len = sizeof program};
@@ -214,23 +228,25 @@ static void send_memory(const char *name) {
   close(peer);
 }
 
-// The function behind ours. What Python's nodes load is in no scope of ours: rcl needs all of it.
-static void *next_one(const char *name) {
-  void *found = dlsym(RTLD_NEXT, name);
-  void *rcl = found ? NULL : dlopen("librcl.so", RTLD_LAZY | RTLD_NOLOAD);
-  return rcl ? dlsym(rcl, name) : found;
+// The function of this name in the libraries behind ours; NULL: there is none. What Python loads for
+// a node is not in the scope that RTLD_NEXT searches; but librcl needs all of it, so its scope has it.
+static void *function_behind(const char *name) {
+  void *address = dlsym(RTLD_NEXT, name);
+  if (address) return address;
+  void *rcl = dlopen("librcl.so", RTLD_LAZY | RTLD_NOLOAD);
+  return rcl ? dlsym(rcl, name) : NULL;
 }
 
 static void append(uint16_t event, const uint64_t *values, unsigned texts);
 
-// Have the kernel give the pages of an area now, so that writing to it later cannot fail; false: it
-// has none left. Before Linux 5.14 it cannot be asked: there the pages come as they are written.
+// Have the kernel give the pages of an area now, so that writing to it later cannot fail. Return
+// false if it has none left. Before Linux 5.14 there is no such request: pages come when written to.
 static bool claim(void *area, size_t size) {
   return madvise(area, size, MADV_POPULATE_WRITE) == 0 || errno == EINVAL;
 }
 
-// A memory file of that size. A limit on the size of files holds for it too, and sends SIGXFSZ, which
-// would end the node: that signal is blocked here and taken back.
+// Make a file in memory of that size; return its descriptor, or -1. A limit on the size of files holds
+// for it, too, and sends SIGXFSZ, which would end the node: it is blocked here, and removed if it came.
 static int new_file(size_t size) {
   sigset_t too_large, before, pending;
   sigemptyset(&too_large);
@@ -242,13 +258,14 @@ static int new_file(size_t size) {
   if (failed && errno == EFBIG && !sigismember(&pending, SIGXFSZ))
     while (sigtimedwait(&too_large, NULL, &(struct timespec){0, 0}) < 0 && errno == EINTR) continue;
   pthread_sigmask(SIG_SETMASK, &before, NULL);
-  // It stays as long as it is: who has it mapped elsewhere relies on that.
+  // Its size never changes: a recorder that has it mapped relies on that.
   failed = failed || (file >= 0 && fcntl(file, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL));
   if (!failed) return file;
   close(file);
   return -1;
 }
 
+// Map the memory's file, with room for all but the rings' records; NULL: there is none.
 static struct memory *mapped(int file) {
   void *area = mmap(NULL, sizeof(struct memory), PROT_READ | PROT_WRITE, MAP_SHARED, file, 0);
   if (area == MAP_FAILED) return NULL;
@@ -257,6 +274,7 @@ static struct memory *mapped(int file) {
   return NULL;
 }
 
+// Fill the header, but for `magic`, which says that all is there.
 static void begin(struct memory *made) {
   made->format = FORMAT;
   made->pid = (uint32_t)getpid();
@@ -276,13 +294,14 @@ static void close_file(void) {
   descriptor = -1;
 }
 
-// As a thread ends. What it emits behind this gets a ring anew, and gives it back again.
+// Called when a thread ends. If it emits events after this, it takes a ring again, and this is called
+// once more.
 static void give_back(void *ring) {
-  own.ring = NULL;
+  thread.ring = NULL;
   if (*memory_is_ours) ((struct ring *)ring)->taken = 0;
 }
 
-// A child of fork() has its parent's memory mapped, and gets its own at its first event.
+// Called in a child process, which has its parent's memory mapped; its own is made at its first event.
 static void in_child(void) {
   *memory_is_ours = 1;
   close_file();
@@ -290,11 +309,11 @@ static void in_child(void) {
   memory = NULL;
   refused = false;
   if (has_key) pthread_setspecific(at_end, NULL);
-  memset(&own, 0, sizeof own);
+  memset(&thread, 0, sizeof thread);
 }
 
-// As the library is loaded. Children of which fork() does not tell (a bare system call, `_Fork`) find
-// at their first event that the kernel has emptied a page of theirs.
+// Called when the library is loaded. fork() calls `in_child`. A child that was made otherwise (by a
+// bare system call, or `_Fork`) sees at its first event that the kernel has emptied the page.
 __attribute__((constructor)) static void prepare(void) {
   has_key = pthread_key_create(&at_end, give_back) == 0;
   long size = sysconf(_SC_PAGESIZE);
@@ -305,7 +324,7 @@ __attribute__((constructor)) static void prepare(void) {
   pthread_atfork(NULL, NULL, in_child);
 }
 
-// Make the memory of this process, and say where it is; false: it cannot be had.
+// Make the memory of this process, and send it to a recorder that waits; false: there is no memory.
 static bool make_memory(void) {
   int file = new_file(sizeof(struct memory));
   struct memory *made = file < 0 ? NULL : mapped(file), *none = NULL;
@@ -317,16 +336,17 @@ static bool make_memory(void) {
     if (made) munmap(made, sizeof(struct memory));
     if (file >= 0) close(file);
     refused = !memory;
-    return memory;  // another thread was faster, or there is none
+    return memory;  // of another thread, which was faster; or there is none
   }
-  // Who attaches takes the first memory that has this: not one that was made in vain beside it.
+  // A recorder that attaches takes the first memory with this number, so a memory that is thrown away
+  // never gets it.
   atomic_thread_fence(memory_order_release);
   *(volatile uint32_t *)&made->magic = 0x63687368;
   fstat(file, &identity);
   descriptor = file;
   Dl_info behind;
-  void *function = next_one("ros_trace_callback_start");
-  own.tid = (uint32_t)syscall(SYS_gettid);
+  void *function = function_behind("ros_trace_callback_start");
+  thread.tid = (uint32_t)syscall(SYS_gettid);
   if (function && dladdr(function, &behind) && behind.dli_fname)
     append(LIBRARY, (uint64_t[6]){(uintptr_t)behind.dli_fname}, 1);
   const char *reader = getenv("CHAINSHAPER_TRACE");
@@ -334,6 +354,7 @@ static bool make_memory(void) {
   return true;
 }
 
+// Whether the process has its memory; makes it at the first call.
 static bool is_ready(void) {
   if (__builtin_expect(!*memory_is_ours, 0)) in_child();
   if (memory) return true;
@@ -344,10 +365,11 @@ static bool is_ready(void) {
   return made;
 }
 
+// Take a free ring for this thread; false: there is none (the event is counted), or no memory.
 static bool has_ring(void) {
   if (!is_ready()) return false;
-  own.tid = (uint32_t)syscall(SYS_gettid);
-  own.rseq = rseq_at(rseq_offset);
+  thread.tid = (uint32_t)syscall(SYS_gettid);
+  thread.rseq = rseq_at(rseq_offset);
   struct memory *all = memory;
   for (unsigned number = 0; number < RINGS; number++) {
     uint32_t none = 0;
@@ -359,33 +381,35 @@ static bool has_ring(void) {
       all->ring[number].taken = 0;
       break;
     }
-    own.records = all->records[number];
-    own.ring = &all->ring[number];
-    if (has_key) pthread_setspecific(at_end, own.ring);
+    thread.records = all->records[number];
+    thread.ring = &all->ring[number];
+    if (has_key) pthread_setspecific(at_end, thread.ring);
     return true;
   }
   atomic_fetch_add(&all->dropped, 1);
   return false;
 }
 
-// `time` 0: now.
+// Write an event into the thread's ring. `time` 0: now. `timed`: values[2] is the thread's CPU time.
 static inline __attribute__((always_inline)) void write_record(
   uint16_t event, uint64_t time, unsigned count, const uint64_t *values, bool timed) {
-  bool is_known = own.ring && *memory_is_ours;
+  bool is_known = thread.ring && *memory_is_ours;
   if (__builtin_expect(!is_known, 0) && !has_ring()) return;
-  uint64_t number = atomic_load_explicit(&own.ring->written, memory_order_relaxed);
-  struct record *record = &own.records[number & (RING_RECORDS - 1)];
-  // Who sees any of this record sees the count of those before, and that its room is taken again.
+  uint64_t number = atomic_load_explicit(&thread.ring->written, memory_order_relaxed);
+  struct record *record = &thread.records[number & (RING_RECORDS - 1)];
+  // A reader that sees any part of this record also sees the count of the records before it. From that
+  // count it knows that the oldest record, in whose place this one comes, may be overwritten.
   atomic_thread_fence(memory_order_release);
   if (!time) time = now(CLOCK_MONOTONIC);
   stamp(record, time);
   atomic_store_explicit(&record->event, event, memory_order_relaxed);
   for (unsigned place = 0; place < count; place++) record->values[place] = values[place];
   if (timed) record->values[2] = thread_time(time);
-  atomic_store_explicit(&own.ring->written, number + 1, memory_order_release);
+  atomic_store_explicit(&thread.ring->written, number + 1, memory_order_release);
 }
 
-// An event of creation and its texts (places as bits), one behind the other, nothing between them.
+// Append an event of creation, and right behind it records with its texts. `texts`: the places of
+// arguments that are texts, as bits.
 static void append(uint16_t event, const uint64_t *values, unsigned texts) {
   struct memory *all = memory;
   size_t length[5];
@@ -419,7 +443,7 @@ static void append(uint16_t event, const uint64_t *values, unsigned texts) {
 }
 
 static void create(uint16_t event, unsigned texts, unsigned gid, uint64_t *values) {
-  if (!own.tid) own.tid = (uint32_t)syscall(SYS_gettid);
+  if (!thread.tid) thread.tid = (uint32_t)syscall(SYS_gettid);
   if (!is_ready()) return;
   if (gid && values[gid]) memcpy(&values[gid], (const void *)(uintptr_t)values[gid], 16);
   append(event, values, texts);
@@ -433,30 +457,31 @@ enum { before_first = FIRST_EVENT - 1, ALL_EVENTS(NUMBER, NUMBER, NUMBER) };
 typedef void (*function)(ARGUMENTS);
 typedef bool (*question)(void);
 
-// What stands behind us: `ros_trace_<event>`, `ros_trace_do_<event>` since tracetools 6, which has
-// asked `ros_trace_enabled_<event>` before. We say yes to that, for a callback's name is computed
-// only then. Resolved at the first call; that several threads do it at once does no harm.
+// The functions of an event: `ros_trace_<event>`; and since tracetools 6 `ros_trace_do_<event>`, which
+// callers call if `ros_trace_enabled_<event>` returns true. Ours always does, since callers compute a
+// callback's name only then; so whether the function behind is enabled is asked here. The function
+// behind is looked up at the first call; it does no harm if several threads do so at once.
 #define HOOK(name, write) \
   void ros_trace_##name(ARGUMENTS) { \
     static _Atomic(function) behind; \
-    static _Atomic bool looked; \
+    static _Atomic bool looked_up; \
     write; \
-    if (!looked) { \
-      behind = (function)next_one("ros_trace_" #name); \
-      looked = true; \
+    if (!looked_up) { \
+      behind = (function)function_behind("ros_trace_" #name); \
+      looked_up = true; \
     } \
     if (behind) behind(a, b, c, d, e); \
   } \
   void ros_trace_do_##name(ARGUMENTS) { \
     write; \
-    function behind = (function)next_one("ros_trace_do_" #name); \
-    question enabled = (question)next_one("ros_trace_enabled_" #name); \
+    function behind = (function)function_behind("ros_trace_do_" #name); \
+    question enabled = (question)function_behind("ros_trace_enabled_" #name); \
     if (behind && enabled && enabled()) behind(a, b, c, d, e); \
   } \
   bool ros_trace_enabled_##name(void) { return true; }
 
 #define EVENT_HOOK(name, count, timed) \
-  HOOK(name, own.latest = number_##name; \
+  HOOK(name, thread.latest = number_##name; \
        write_record(number_##name, 0, count, ((uint64_t[6]){a, b, c, d, e}), timed))
 #define CREATION_HOOK(name, texts, gid) \
   HOOK(name, create(number_##name, texts, gid, (uint64_t[6]){a, b, c, d, e}))
@@ -482,7 +507,7 @@ static void write_call(uint16_t event, uint64_t time, const void *handle, const 
 
 #define BEHIND(name, ...) \
   static int (*_Atomic behind)(__VA_ARGS__); \
-  if (!behind) behind = (int (*)(__VA_ARGS__))next_one(#name)
+  if (!behind) behind = (int (*)(__VA_ARGS__))function_behind(#name)
 
 int rmw_send_request(const void *client, const void *request, int64_t *number) {
   BEHIND(rmw_send_request, const void *, const void *, int64_t *);
@@ -516,22 +541,23 @@ TAKE(rmw_take_response)
 int rmw_take_with_info(const void *subscription, void *message, bool *taken, int64_t *info,
                        void *allocation) {
   BEHIND(rmw_take_with_info, const void *, void *, bool *, int64_t *, void *);
-  own.latest = 0;
+  thread.latest = 0;
   int result = behind(subscription, message, taken, info, allocation);
-  if (result == 0 && *taken && own.latest != number_rmw_take)
+  if (result == 0 && *taken && thread.latest != number_rmw_take)
     ros_trace_rmw_take((uintptr_t)subscription, (uintptr_t)message, (uint64_t)*info, true, 0);
   return result;
 }
 
-// Functions of rcl, of which ros2_tracing has no event. Since Jazzy the one may call the other.
+// Calls of timers: ros2_tracing has no event for them. Since Jazzy the first of these functions may
+// call the second: it is one call then.
 #define TIMER_CALL(name) \
   int name(uint64_t timer, uint64_t information) { \
     BEHIND(name, uint64_t, uint64_t); \
-    bool outer = !own.calls_timer; \
-    own.calls_timer = true; \
+    bool outer = !thread.calls_timer; \
+    thread.calls_timer = true; \
     int result = behind(timer, information); \
     if (!outer) return result; \
-    own.calls_timer = false; \
+    thread.calls_timer = false; \
     if (!result) write_record(number_rcl_timer_call, 0, 1, (uint64_t[6]){timer}, false); \
     return result; \
   }

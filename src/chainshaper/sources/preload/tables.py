@@ -23,7 +23,7 @@ _COMMON = ("time", "tid", "cpu")
 
 
 def creation_tables(process: TracedProcess) -> tuple[dict[str, pl.DataFrame], TracingLibrary]:
-    """Return the tables of what a process has created, and the tracing library behind ours."""
+    """Return the tables of a process's events of creation, and the tracing library behind ours."""
     objects, texts = process.objects()
     places = np.flatnonzero(objects["event"] == LIBRARY)
     path = ""
@@ -42,7 +42,7 @@ def event_tables(
 
 
 def joined_tables(parts: Iterable[Mapping[str, pl.DataFrame]]) -> dict[str, pl.DataFrame]:
-    """Return the tables of several processes as those of one application, in order of time."""
+    """Join the tables of several processes, in order of time."""
     parts_of: dict[str, list[pl.DataFrame]] = {}
     for tables in parts:
         for name, table in tables.items():

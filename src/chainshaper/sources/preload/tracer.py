@@ -54,7 +54,7 @@ class PreloadTracer:
         self._processes: list[TracedProcess] = []
         self._names: dict[int, str] = {}
         self._refused: list[str] = []  # sentences: nothing of these is recorded, and why
-        self._found: set[int] = set()  # attached to, by the ids that they have here
+        self._known: set[int] = set()  # processes attached to or refused, by the ids they have here
         self._searched_ns = 0
 
     def start(self) -> Mapping[str, str]:
@@ -164,12 +164,12 @@ class PreloadTracer:
 
         def refuse(pid: int, why: str) -> None:
             if not self._pids or pid in family:
-                self._found.add(pid)
+                self._known.add(pid)
                 self._refused.append(why)
 
-        for pid, process in memories(self._users, self._found, refuse):
+        for pid, process in memories(self._users, self._known, refuse):
             if not self._pids or pid in family:
-                self._found.add(pid)
+                self._known.add(pid)
                 self._processes.append(process)
 
     def _take_memory(self, peer: socket.socket) -> None:

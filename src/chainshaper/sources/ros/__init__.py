@@ -1,11 +1,15 @@
-"""Asking an application's own ROS 2 while it runs, by a script of ours (:mod:`.script`).
+"""Ask the ROS 2 of a running application, by a script (:mod:`.script`).
 
-The Python that has `rclpy` is seldom ours, and domain and RMW are those of the application's nodes.
-An environment says which programs and libraries are loaded: whoever wrote it chooses what runs. So
-here alone something is run that was found through another process: with the rights of that
-process's user, without capabilities or a way to get any, in that environment and a session of its
-own, with no files of ours but the script and the files that it may print into, and for a limited
-time. What it prints is not trusted.
+The script runs in the environment of one of the application's processes: our own Python seldom has
+`rclpy`, and DDS domain and RMW must be those of the application's nodes. An environment says which
+programs and libraries are loaded, so whoever wrote it chooses what runs. (Nowhere else does
+chainshaper run something that it finds through another process.) Therefore the script
+
+* has the rights of that process's user, no capabilities, and no way to get any;
+* runs in a session of its own, for a limited time;
+* has no open files but the script itself and the files that it may print into.
+
+What it prints is not trusted.
 """
 
 import ctypes
@@ -32,7 +36,7 @@ from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import EndpointInfo
 
 _NOT_FOR_US = ("LD_PRELOAD",)
-"""What is loaded into the nodes for tracing shall not trace us."""
+"""Variables that are left out: libraries that trace the nodes must not trace the script."""
 
 _WITH_ITS_PYTHON = """
 set -f
@@ -41,14 +45,14 @@ if ros2=$(command -v ros2) && IFS= read -r first < "$ros2"; then
 fi
 exec python3 - "$@"
 """
-"""The Python that the environment's `ros2` runs with: another one cannot load `rclpy`."""
+"""Runs the script by the Python of the environment's `ros2`: others may have no `rclpy`."""
 
 _MOST_PRINTED = 8 << 20
 _LOOKS = 6
 _SAME_PLACES = ("ns/user", "ns/mnt", "root")
 _PR_SET_NO_NEW_PRIVS, _CAPABILITY_VERSION_3 = 38, 0x20080522
 _PATIENCE_S, _START_S = 10, 20
-"""How long discovery may take, and Python and RMW to load beside it."""
+"""The time that discovery may take; and Python and the RMW, to be loaded."""
 _NAME = re.compile(r"[!-~]{0,255}/[!-~]{1,255}")
 _LARGEST = 1 << 63
 _libc = ctypes.CDLL(None, use_errno=True)
@@ -56,7 +60,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 @dataclass(frozen=True)
 class Environment:
-    """An environment, and the user whose rights whatever is found through it gets."""
+    """An environment, and the user with whose rights programs run in it."""
 
     variables: Mapping[str, str]
     user: int
@@ -64,7 +68,7 @@ class Environment:
 
 @dataclass(frozen=True)
 class Script:
-    """A script that runs, and files in memory into which it writes (descriptors)."""
+    """A script that runs, and the descriptors of the files in memory into which it writes."""
 
     process: "subprocess.Popen[bytes]"
     output: int  # what it prints
@@ -75,9 +79,9 @@ class Script:
         return self.process.poll() is not None
 
     def end(self, within_s: float = 0.0) -> tuple[str, str | None]:
-        """Wait for its end, or end its group; return what it printed, and why it failed, if so.
+        """Wait for its end; return what it printed, and why it failed, if it did.
 
-        To be called once.
+        Kills its process group if it does not end in time. To be called once.
         """
         problem = None
         try:
@@ -108,13 +112,13 @@ def environment_of(pid: int) -> Environment:
                 os.readlink(place, dir_fd=folder) != str(Path("/proc/self", place).readlink())
                 for place in _SAME_PLACES
             )
-            same = user_in(folder) == user  # nor has it become another program meanwhile
+            same_user = user_in(folder) == user  # else it has become another program meanwhile
     except OSError as error:
         raise OperationError(
             f"the environment of process {pid} cannot be read: {error.strerror}"
         ) from error
     unused = "so nothing that its environment names is run"
-    if user is None or not same:
+    if user is None or not same_user:
         raise OperationError(f"process {pid} was started by another user than runs it, {unused}")
     if elsewhere:
         raise OperationError(
@@ -178,14 +182,14 @@ def start_with_rclpy(
 
 
 def _becoming(user: int) -> dict[str, Any]:
-    """Return what has `subprocess` start a process as a user; nothing if that is who we are.
+    """Return the arguments of `subprocess` that start a process as a user; none for our own user.
 
     Raises OperationError: there is no such user, or we may not become it.
     """
     if user == os.geteuid():
         return {}
     try:
-        known = pwd.getpwuid(user)
+        account = pwd.getpwuid(user)
     except KeyError:
         raise OperationError(
             f"user {user} of the application is not in this machine's user database: nothing is run"
@@ -193,15 +197,15 @@ def _becoming(user: int) -> dict[str, Any]:
         ) from None
     if os.geteuid() != 0:
         raise OperationError(
-            f"the application is user {known.pw_name}'s, and what its environment names is run by "
-            "that user only: run chainshaper as that user, or as root"
+            f"the application is user {account.pw_name}'s, and what its environment names is run "
+            "by that user only: run chainshaper as that user, or as root"
         )
-    groups = os.getgrouplist(known.pw_name, known.pw_gid)
-    return {"user": user, "group": known.pw_gid, "extra_groups": groups}
+    groups = os.getgrouplist(account.pw_name, account.pw_gid)
+    return {"user": user, "group": account.pw_gid, "extra_groups": groups}
 
 
 def _confine(parent: int) -> None:
-    """Take from a new process what it has beyond its user's rights; it ends with us."""
+    """Limit a new process to its user's rights, and make it end with us."""
     _libc.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
     if os.getuid() != 0:
         header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
@@ -229,8 +233,8 @@ def _content(descriptor: int) -> str:
 def ask_graph(environment: Environment) -> tuple[tuple[EndpointInfo, ...], str | None]:
     """Return all endpoints in the ROS graph of a node with this environment, or why there are none.
 
-    DDS without its security plug-ins does not prove who is in the graph: the answer is bounded and
-    checked in its form, and believed in names, types and QoS only.
+    DDS without its security plug-ins does not prove who is in the graph. So the size and the form
+    of the answer are checked, and only names, types and QoS are taken from it.
     """
     answer, problem = run_with_rclpy(
         environment,
