@@ -106,8 +106,9 @@ class Running:
     def start(cls, *arguments: str | Path) -> "Running":
         mark = f"MARK_{uuid.uuid4().hex}=1"
         name, _, value = mark.partition("=")
+        # Who runs tests in the background, or under nohup, has them ignore these signals.
         process = subprocess.Popen(
-            _command(arguments),
+            ["env", "--default-signal=INT,HUP", *_command(arguments)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

@@ -110,6 +110,7 @@ def test_every_argument_of_every_function_arrives_as_it_was_passed(
     assert set(event_names()) - emitted == {"rcl_timer_call", *SERVICE_CALLS}, "tested apart"
 
 
+@pytest.mark.timeout(900)
 def test_every_argument_arrives_on_arm64(tmp_path: Path) -> None:
     program = build(tmp_path / "prefix", compiler="aarch64-linux-gnu-gcc")
     if shutil.which("qemu-aarch64") is None:

@@ -145,6 +145,7 @@ def run(program: Path, tmp_path: Path) -> Callable[..., Run]:
     return started
 
 
+@pytest.mark.timeout(900)
 def test_it_is_built_for_arm64() -> None:
     built = (built_for_arm64() / gate_library().name).read_bytes()
     assert int.from_bytes(built[18:20], "little") == 183  # EM_AARCH64

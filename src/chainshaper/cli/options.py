@@ -281,6 +281,11 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
     from chainshaper.values.yaml_file import wrong_values_refused
 
     topic, colon, listed = text.partition(":")
+    if not colon and text.startswith("/"):
+        raise InputError(
+            f"--modes {text}: which modes does it announce? Write each mode once behind it, such as"
+            f" {text}:city,highway"
+        )
     if not colon:
         raise InputError(
             f"--modes {text}: which topic announces the modes? Write it in front of them, such as"
