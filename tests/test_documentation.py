@@ -158,7 +158,7 @@ def test_every_command_runs(page: Path, tmp_path: Path, recorded: Path) -> None:
 def demo_puts_everything_into_one_folder(folder: Path) -> None:
     assert sorted(entry.name for entry in folder.iterdir()) == [
         *("after", "application.yaml", "before", "comparison.json"),
-        *("distribution.png", "latency.png", "plan.yaml"),
+        *("plan.yaml", "report.html"),
     ]
     example = (ROOT / "examples/synthetic_chain.yaml").read_text()
     assert (folder / "application.yaml").read_text() == example
