@@ -514,7 +514,7 @@ def _with_restarts(flow: DataFlow) -> DataFlow:
     names = flow.followed.group_by("node", "last_pid", maintain_order=True).agg("pid")
     notes = (
         f"{node} was started again (processes {', '.join(map(str, pids))}): it counts as one node."
-        for node, _, pids in names.iter_rows()
+        for node, _, pids in names.sort("node", "last_pid").iter_rows()
     )
     return replace(
         flow,
