@@ -526,7 +526,7 @@ TWICE = [*_node("/a", 100, "executor"), *_node("/a", 200, "executor")]
     [
         (PUBLISHER_B, ALONE, r"thread 200 \(executor\).*core 1 only.*taskset"),
         (EXECUTOR_A, OTHER, "/a of the plan is not running.*running: /other"),
-        (EXECUTOR_A, [], "running: no node"),
+        (EXECUTOR_A, [], "no node of the plan runs, nor any other: start the robot first"),
         (PUBLISHER_B, UNKNOWN, "process 200 .* asynchronous publisher.*threads 200"),
         (EXECUTOR_A, TWICE, "/a is ambiguous: processes 100, 200 all have it"),
     ],

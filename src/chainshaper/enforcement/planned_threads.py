@@ -54,7 +54,7 @@ def threads_for(planned: Thread, allocation: Allocation) -> list[NodeThread]:
             )
         raise OperationError(
             f"node {planned.node} of the plan is not running, or cannot be recognised; running: "
-            f"{', '.join(running) or 'no node'}; start it with `--ros-args -r __node:=NAME`, or"
+            f"{', '.join(running)}; start it with `--ros-args -r __node:=NAME`, or"
             " name a recording of it"
             + (f"; {allocation.strangers}" if allocation.strangers else "")
         )
