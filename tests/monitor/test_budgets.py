@@ -75,12 +75,12 @@ def test_a_slower_callback_breaks_limits_and_is_named(
     recording: Recording, slowed: Recording
 ) -> None:
     broken = [one for one in check_budget(slowed, propose_budget(recording)) if not one.met]
-    found = {(one.where, one.figure) for one in broken}
+    found = {(limit.where, limit.figure) for limit in broken}
     assert {("/t1../t3", "maximum"), ("/t1../t3", "p50"), ("/t1../t3", "p99")} <= found
     assert ("/t1../t3", "computation of /t2") in found
     assert {("/second (/t1)", "response"), ("/second (/t1)", "execution")} <= found
     assert not any("/third" in where or "/first" in where for where, _ in found)
-    (maximum,) = (one for one in broken if one.figure == "maximum")
+    (maximum,) = (limit for limit in broken if limit.figure == "maximum")
     assert maximum.measured == measure_latency(slowed).analysis.statistics.max_ns
     assert "from computation of /t2" in (maximum.because or "")
     assert maximum.text.startswith("/t1../t3: maximum ")
@@ -225,6 +225,6 @@ def test_of_callbacks_with_one_name_the_longest_counts(recording: Recording) -> 
     both = {name: pl.concat([recording.events[name], table]) for name, table in again.items()}
     whole = replace(recording, events={**recording.events, **both})
     budget = propose_budget(recording, room=0.1)
-    judged = {(one.where, one.figure): one for one in check_budget(whole, budget)}
+    judged = {(limit.where, limit.figure): limit for limit in check_budget(whole, budget)}
     limit = judged["/second (/t1)", "response"]
     assert limit.measured == pytest.approx(limit.limit / 1.1 + 2 * MS, abs=20_000)

@@ -186,10 +186,10 @@ def _through_next_stage(
 
 def _whole_slot(stage: Server, cycle_ns: int) -> Slot:
     """Return a stage's slot, which may go beyond the end of the cycle, as one."""
-    (first, *_), (last, *_) = stage.slots[0], stage.slots[-1]
-    if len(stage.slots) > 1 and first == 0 and stage.slots[-1][1] == cycle_ns:
-        return last, cycle_ns + stage.slots[0][1]
-    return first, stage.slots[-1][1]
+    (first_opens, first_closes), (last_opens, last_closes) = stage.slots[0], stage.slots[-1]
+    if len(stage.slots) > 1 and first_opens == 0 and last_closes == cycle_ns:
+        return last_opens, cycle_ns + first_closes
+    return first_opens, last_closes
 
 
 def _until_cycle_end(plan: ChainPlan, end_ns: int) -> dict[str, Sequence[Slot]]:

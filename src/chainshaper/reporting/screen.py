@@ -87,7 +87,7 @@ class TimeAxis:
         return (time_ns - self.first_ns) // self.column_ns
 
     def scale(self) -> str:
-        """The numbers of the ticks, each beginning at its column; the last with its unit."""
+        """Return the numbers of the ticks, each at its column, and the unit behind the last."""
         line, time_ns = "", self.first_ns
         while (column := self.column_of(time_ns)) < _AXIS:
             number = f"{time_ns / MS:g}"
@@ -98,7 +98,7 @@ class TimeAxis:
         return line + " ms"
 
     def histogram(self, latencies: NDArray[np.int64]) -> str:
-        """A character a column, as high as its outputs are many; few are a dot."""
+        """Return a character for each column: the more outputs, the higher; few are a dot."""
         columns = (latencies - self.first_ns) // self.column_ns
         counts = np.bincount(columns, minlength=_AXIS)[:_AXIS]
         if not latencies.size:
@@ -109,7 +109,10 @@ class TimeAxis:
         drawn = ""
         for count in counts:
             height = round(count / highest * len(_HEIGHTS))
-            drawn += _HEIGHTS[height - 1] if height else "·" if count else " "
+            if height:
+                drawn += _HEIGHTS[height - 1]
+            else:
+                drawn += "·" if count else " "
         return drawn
 
 
@@ -132,8 +135,7 @@ def figure_rows(before: Measurement, after: Measurement) -> list[Text]:
         _row("average", _ms(first.mean_ns), _ms(last.mean_ns), f"{average}   the price"),
         _row("late", _late_unshaped(before, after), _late_shaped(after), "of all cycles"),
     ]
-    for row in rows[:1]:
-        row.stylize("bold")
+    rows[0].stylize("bold")
     lines = [Text(f"{'before':>27}{'shaped':>18}", style="bold"), *rows]
     jitters = [_ms(statistics.jitter_ns) for statistics in received if statistics is not None]
     if len(jitters) == len(received):
@@ -162,6 +164,7 @@ def verdict_lines(before: Measurement, after: Measurement) -> list[Text]:
 
 
 def _promise_lines(after: Measurement) -> list[Text]:
+    """Say whether the plan's promise was kept; nothing where no plan was in force."""
     judged, plan = after.prediction, after.plan
     if plan is None or judged is None:
         return []
@@ -175,7 +178,9 @@ def _promise_lines(after: Measurement) -> list[Text]:
     if not outputs.missed:
         return [_line("✓", f"As planned: every output at {places}, none late.")]
     promised = percent(outputs.promised)
-    return [_line("✓", f"As planned: outputs at {places}; {outputs.text}, of {promised} planned.")]
+    return [
+        _line("✓", f"As planned: outputs at {places}; {outputs.text}, at most {promised} may be.")
+    ]
 
 
 def _machine_lines(before: Measurement, after: Measurement) -> list[Text]:
@@ -193,7 +198,7 @@ def _machine_lines(before: Measurement, after: Measurement) -> list[Text]:
 
 
 def _line(mark: str, text: str) -> Text:
-    """A line behind a mark; what does not fit is folded below its beginning."""
+    """Make a line with a mark in front; a longer text goes on below, indented."""
     folded = textwrap.fill(shown(text), WIDTH - 5, break_long_words=False, break_on_hyphens=False)
     line = Text(f"  {mark} ", style="bold green" if mark == "✓" else "bold yellow")
     line.append(textwrap.indent(folded, " " * 4)[4:], style="not bold default")
@@ -245,7 +250,7 @@ def _times(before: LatencyStatistics, after: LatencyStatistics) -> str:
 
 
 def _number(value: float) -> str:
-    """Two digits that count, and no more."""
+    """Return a number as text with two significant digits."""
     digits = 1 if value < 10 else -(len(f"{value:.0f}") - 2)
     return f"{round(value, digits):,.{max(0, digits)}f}"
 
@@ -258,7 +263,10 @@ def _late_shaped(after: Measurement) -> str:
 
 
 def _late_unshaped(before: Measurement, after: Measurement) -> str:
-    """How many outputs came behind the last slot when there was none, if the machine stalled."""
+    """Count the unshaped outputs that came later than the plan's last slot ends.
+
+    It is shown beside the shaped ones' only where the machine stalled while they were measured.
+    """
     if after.plan is None or not after.analysis.statistics.disturbed:
         return ABSENT
     slots = publish_slots(after.plan)

@@ -313,20 +313,20 @@ def join_runs(runs: Sequence[Recording], output: str | Path) -> Recording:
     lost = Counter[str]()
     for run in runs:
         lost.update(run.info.lost)
+    realtime, stall_meter = None, None
+    if all(run.info.realtime is not None for run in runs):
+        realtime = all(run.info.realtime for run in runs)
+    if len(meters) == len(runs):
+        wakeups = sum(meter.wakeups for meter in meters)
+        stall_meter = meters[-1].model_copy(update={"wakeups": wakeups})
     joined = {
         "processes": {pid: name for run in runs for pid, name in run.info.processes.items()},
         "threads": tuple(thread for run in runs for thread in run.info.threads),
         "endpoints": tuple(endpoint for run in runs for endpoint in run.info.endpoints),
         "notes": tuple(dict.fromkeys(note for run in runs for note in run.info.notes)),
-        "realtime": None
-        if any(run.info.realtime is None for run in runs)
-        else all(run.info.realtime for run in runs),
+        "realtime": realtime,
         "lost": dict(lost),
-        "stall_meter": meters[-1].model_copy(
-            update={"wakeups": sum(meter.wakeups for meter in meters)}
-        )
-        if len(meters) == len(runs)
-        else None,
+        "stall_meter": stall_meter,
         "in_force": None,  # throughout, if at all
         "pauses_ns": pauses,
         "checksums": None,
@@ -335,7 +335,7 @@ def join_runs(runs: Sequence[Recording], output: str | Path) -> Recording:
 
 
 def _span(tables: EventTables) -> tuple[int, int]:
-    """When the first and the last callback of a run started (ns)."""
+    """Return when the first and the last callback of a run started (ns)."""
     starts = table(tables, "callback_start")["time"]
     return int(starts.min() or 0), int(starts.max() or 0)  # type: ignore[arg-type]
 
