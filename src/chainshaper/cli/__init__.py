@@ -20,7 +20,7 @@ from typing import Any, NoReturn
 __all__ = ["main"]
 
 REMEDY = "raise the limit (`ulimit -v`), free memory, or give a smaller input"
-OF_ANALYSIS = ("matplotlib",)
+OF_ANALYSIS = ("matplotlib", "resvg_py")
 """The packages of the extra `analysis`, which robots do not have."""
 _LACK_OF_MEMORY = (
     "cannot allocate memory",

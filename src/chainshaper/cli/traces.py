@@ -144,6 +144,11 @@ def latency(
     chains: Path | None = opt.option(
         "--chains FILE", "A CARET architecture file: --chain then names one of its named_paths."
     ),
+    figures: Path | None = opt.option(
+        "--figures DIR",
+        "Draw latency.png, hops.png (every cycle, stacked by hop), distribution.png and graph.png"
+        " (the nodes, with times) into this folder.",
+    ),
     json: bool = opt.JSON,
     instances: bool = opt.option("--instances", "With --json: every traversal, one by one.", False),
 ) -> None:
@@ -158,14 +163,22 @@ def latency(
     if instances and not json:
         raise InputError("--instances goes with --json: add it")
     chain = chain if chains is None else named_chain(chains, chain)
-    with out.opened("latency", trace) as (recording, _):
+    with out.opened("latency", trace) as (recording, report):
         measurement = cs.measure_latency(recording, chain)
+        drawn: tuple[Path, ...] = ()
+        if figures is not None:
+            from chainshaper.reporting.figures import draw_measurement
+
+            report(0.8, "drawing")
+            drawn = draw_measurement(measurement, figures)
     analysis = measurement.analysis
     values = of_chain.latency_json(measurement, instances=instances)
     values |= of_chain.breakdown_json(analysis)
     tables = of_chain.latency_table(measurement), of_chain.breakdown_table(analysis)
     if out.present(json, values, *tables):
         out.show_line(f"{of_chain.doubts_text(measurement)}; {out.lost_events(recording)}")
+        for path in drawn:
+            out.show_line(path)
         out.notes(analysis.notes)
 
 
@@ -386,7 +399,7 @@ def compare(
     recordings: list[Path] = opt.argument("REC REC...", "Recordings' folders.", ...),
     chain: str | None = opt.CHAIN,
     figures: Path | None = opt.option(
-        "--figures DIR", "Draw latency.png and distribution.png into this folder."
+        "--figures DIR", "Draw latency.png, hops.png and distribution.png into this folder."
     ),
     plan: Path | None = opt.PLAN_IN_FORCE,
     strict: bool = opt.STRICT,

@@ -4,7 +4,7 @@ This module imports nothing slow, as the planner does, so that `chainshaper plan
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple, TypeAlias
+from typing import Annotated, Literal, NamedTuple, TypeAlias, TypedDict
 
 from chainshaper.robot.gate import Anchor, IntoOpenSlot, Messages, Overrun
 
@@ -154,3 +154,42 @@ class Wishes:
     with_receivers: Annotated[bool, Option(
         "Give nodes that subscribe to the shaped output SCHED_FIFO below all servers, while"
         " the plan is in force.", flag="--receivers/--no-receivers")] = True
+# fmt: on
+
+
+class WishKeywords(TypedDict, total=False):
+    """The fields of :class:`Wishes` as keyword arguments, for type checkers and editors."""
+
+    policy: Policy
+    publication: Publication
+    publish_slot_ns: int | None
+    slot_start_ns: int | None
+    epsilon_ns: int | None
+    percentile: float | None
+    overrun_probability: float | None
+    ideal_machine: bool
+    bands: int | Literal["auto"]
+    solver: Solver
+    grid_ns: int
+    max_gap_ns: int | None
+    max_share: float | None
+    minimise: Goal
+    mean_at_most_ns: int | None
+    least_gain: float
+    seed: int
+    cores: tuple[int, ...] | None
+    first_slot_ns: int | None
+    anchor: Anchor
+    overrun: Overrun | None
+    into_open_slot: IntoOpenSlot
+    messages: Messages
+    depth: int | None
+    shaping_thread: ShapingThread
+    fallback: Fallback
+    spin_ns: int
+    pause_ns: int | None
+    delivery_ns: int | None
+    equal_priorities: EqualPriorities
+    slot_ends: SlotEnds
+    best_effort: tuple[str, ...]
+    with_receivers: bool
