@@ -49,7 +49,7 @@ from chainshaper.planning.profile import (
 from chainshaper.planning.receivers import with_receivers_placed, without_reception
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
-from chainshaper.values.plan_choices import Policy, WishKeywords, Wishes
+from chainshaper.values.plan_choices import Policy, Wishes, WishKeywords
 
 DEFAULT_CORE = 1
 OWN_SLOTS = (*plans.PER_CALLBACK, "let-per-chain")

@@ -18,7 +18,7 @@ from chainshaper.analysis import LatencyAnalysis, recorded_flow
 from chainshaper.planning import BandChoice, ChainPlan
 from chainshaper.planning.overruns import slots_of_latency
 from chainshaper.reporting.cycle_parts import OPACITY, stacked_cycles
-from chainshaper.reporting.graph_drawing import timed_graph_svg, png_of
+from chainshaper.reporting.graph_drawing import png_of, timed_graph_svg
 from chainshaper.reporting.latency import write_comparison_json
 from chainshaper.reporting.overviews import sweep_axes, sweep_value
 from chainshaper.reporting.page import slot_bars
@@ -141,9 +141,11 @@ def _mark_beyond(
 ) -> bool:
     """Mark cycles that are longer than the axis is, at its end; return whether there are any."""
     beyond = cycles[latency_ms > limit_ms] if limit_ms else cycles[:0]
+    if not len(beyond):
+        return False
     edge = np.full(len(beyond), limit_ms)
     axes.plot(beyond, edge, "^", markersize=6, color=colour, clip_on=False, zorder=5)
-    return bool(len(beyond))
+    return True
 
 
 @_user_style()
@@ -163,7 +165,7 @@ def hops_figure(analyses: Sequence[LatencyAnalysis], titles: Sequence[str]) -> A
     """Make the figure of :func:`draw_hops`, with a title for each analysis."""
     from matplotlib.patches import Patch
 
-    figure, axes = _new_figure(len(analyses))
+    figure, _ = _new_figure(len(analyses))
     panels = figure.axes
     named = dict.fromkeys(name for analysis in analyses for name in hop_names(analysis))
     colours = dict(zip(named, cycle(COLOURS), strict=False))
@@ -175,7 +177,7 @@ def hops_figure(analyses: Sequence[LatencyAnalysis], titles: Sequence[str]) -> A
     panels[0].set_ylabel("latency, hop by hop [ms]")
     looks = [Patch(color=colours[name], label=name) for name in reversed(named)]
     looks += [Patch(color="0.3", alpha=opacity, label=part) for part, opacity in OPACITY.items()]
-    figure.legend(handles=looks, loc="outside right upper")
+    figure.legend(handles=looks, loc="outside lower center", ncols=min(4, len(looks)))
     return figure
 
 
