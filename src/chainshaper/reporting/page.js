@@ -357,6 +357,7 @@ function plotTimeline({ recordings, n: suffix }) {
   const host = document.getElementById(`timeline${suffix}`), buttons = [...host.querySelectorAll("button")];
   const [select, number, about, body] = ["select", "input", ".about", "tbody"]
     .map((one) => host.querySelector(one));
+  const titles = [...host.querySelectorAll("thead th")].slice(1).map((head) => head.textContent);
   let timeline, cycle, drawn;
   const spec = { zoom: "x", pan: true, paint, step: (by) => step(by),
     x: { label: "since the cycle's start [ms]", unit: 1e6 }, y: { label: "", bare: true } };
@@ -407,8 +408,10 @@ function plotTimeline({ recordings, n: suffix }) {
     body.replaceChildren(...cycle.hops.map(([, take, start, publish], n) => {
       const row = document.createElement("tr"), sent = n ? cycle.hops[n - 1][3] : null;
       make(row, "th", timeline.hops[n]).scope = "row";
-      for (const time of [take, start, publish, sent === null ? null : start - sent,
-        publish === null ? null : publish - start]) make(row, "td", time === null ? "–" : ms(time));
+      [take, start, publish, sent === null ? null : start - sent,
+        publish === null ? null : publish - start].forEach((time, column) => {
+        make(row, "td", time === null ? "–" : ms(time)).dataset.title = titles[column];
+      });
       return row;
     }));
     return drawn ? drawn.reset() : (drawn = chart(`timeline${suffix}`, spec));

@@ -307,7 +307,8 @@ def _graph(part: _NamedMeasurement) -> str:
     about = "Beside arrows: from publication to the start of the callback; beside callbacks: from"
     about += " start to end; mean, and maximum, of all that was recorded. Thick: the chain."
     title = f"The graph of {part.name}, with times"
-    return _details(title, f'{_paragraph(about)}<div class="scroll">{drawing}</div>', unfolded=True)
+    content = f'{_paragraph(about)}<div class="drawing">{drawing}</div>'
+    return _details(title, content, unfolded=True)
 
 
 def _prediction(part: _NamedMeasurement) -> str:
