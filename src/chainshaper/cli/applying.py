@@ -60,11 +60,13 @@ def apply(
         "--phase DURATION",
         "Where in a cycle the chain's timer expires, on CLOCK_MONOTONIC: slots then stay there."
         " Default: measured, and followed where it drifts.",
+        rich_help_panel=opt.IN_FORCE,
     ),
     recording: Path | None = opt.option(
         "--recording REC",
         "Of these very processes, or of an earlier run: it tells which threads execute what. "
         "Default: the plan's own, where it exists.",
+        rich_help_panel=opt.THREADS,
     ),
     wait: int | None = opt.option(
         "--wait DURATION",

@@ -29,10 +29,14 @@ def plan(
         "File to write; of several chains also a folder, for a plan each. Must not exist.",
     ),
     latencies: Path | None = opt.option(
-        "--latencies FILE", "Instead of a recording: a duration a line, or .npy in ns."
+        "--latencies FILE",
+        "Instead of a recording: a duration a line, or .npy in ns.",
+        rich_help_panel=opt.EVIDENCE,
     ),
     period: int | None = opt.option(
-        "--period DURATION>0", "Period, with --latencies or a chain that no timer starts."
+        "--period DURATION>0",
+        "Period, with --latencies or a chain that no timer starts.",
+        rich_help_panel=opt.EVIDENCE,
     ),
     *,
     since: int = opt.SINCE,
@@ -48,6 +52,7 @@ def plan(
     convert: Path | None = opt.option(
         "--convert OLD.yaml",
         "Plan nothing: write the plan of an earlier version anew, to --output.",
+        rich_help_panel=opt.EVIDENCE,
     ),
     json: bool = opt.JSON,
 ) -> None:
@@ -324,14 +329,21 @@ def splice(
     message_type: str | None = opt.option(
         "--type PKG/msg/TYPE",
         "Type of the output, for a node in C++. Default: what the recording says.",
+        rich_help_panel=opt.NODE_PANEL,
     ),
     recording: Path | None = opt.option(
         "--recording REC",
         "A recording of the application: it tells publishers, subscribers and types. "
         "Default: the plan's own, where it exists.",
+        rich_help_panel=opt.NODE_PANEL,
     ),
-    fallback: Fallback | None = opt.wish("fallback", default=None),
-    build: bool = opt.option("--build", "Build the shaping node's package with colcon.", False),
+    fallback: Fallback | None = opt.wish("fallback", default=None, rich_help_panel=opt.NODE_PANEL),
+    build: bool = opt.option(
+        "--build",
+        "Build the shaping node's package with colcon.",
+        False,
+        rich_help_panel=opt.NODE_PANEL,
+    ),
     dry_run: bool = opt.option(
         "--dry-run",
         "Write nothing, and show what would be redirected: the launch files are carried out in "

@@ -44,6 +44,7 @@ BUFFER: int | None = opt.option(
     "--buffer MIB",
     "LTTng's buffer of each core, in MiB, for when events were lost. Default: 4.",
     min=1,
+    rich_help_panel=opt.TRACING,
 )
 
 
@@ -229,6 +230,7 @@ def record(
         "--pid",
         "Attach to this process and what it has started (ebpf, preload; may be repeated). "
         "Default, without a COMMAND: everything of the users that looks like ROS 2.",
+        rich_help_panel=opt.TRACING,
     ),
     user: list[str] | None = opt.USERS,
     buffer: int | None = BUFFER,
@@ -306,23 +308,31 @@ def watch(
         "--budget FILE",
         "What chains, hops and callbacks may take in the last minute: a limit that breaks is said,"
         " and the last ten seconds are written.",
+        rich_help_panel="Budgets",
     ),
     recorder: Path = opt.option(
         "--recorder DIR",
         "Where these are written, also by Ctrl-\\: recordings in folders named by their time.",
         Path(),
+        rich_help_panel="Budgets",
     ),
     metrics: int | None = opt.option(
         "--metrics PORT",
         "Serve OpenMetrics (Prometheus) on this port of this machine.",
         min=1,
         max=65535,
+        rich_help_panel="Other programs",
     ),
     otlp: str | None = opt.option(
-        "--otlp URL", "Send metrics there every ten seconds, by OTLP over HTTP (OpenTelemetry)."
+        "--otlp URL",
+        "Send metrics there every ten seconds, by OTLP over HTTP (OpenTelemetry).",
+        rich_help_panel="Other programs",
     ),
     diagnostics: bool = opt.option(
-        "--diagnostics", "Publish the chains on /diagnostics, with the ROS 2 of the nodes.", False
+        "--diagnostics",
+        "Publish the chains on /diagnostics, with the ROS 2 of the nodes.",
+        False,
+        rich_help_panel="Other programs",
     ),
     user: list[str] | None = opt.USERS,
     environment: bool = opt.option(
@@ -490,17 +500,20 @@ def profile(
         "--like REC",
         "An earlier recording of the application: it knows the chain's nodes, components "
         "of containers, and executors with several threads.",
+        rich_help_panel=opt.THREADS,
     ),
     node: list[str] | None = opt.option(
         "--node NAME",
         "A node that gets the priority (may be repeated, the most urgent first). Default: the "
         "chain's, or all, at one priority.",
+        rich_help_panel=opt.THREADS,
     ),
     core: int | None = opt.option(
         "--core",
         "Where executors run. Default: the last core; with --chain and --like, others as well where"
         " branches run at the same time. DDS threads run on the others.",
         min=0,
+        rich_help_panel=opt.THREADS,
     ),
     request: "cs.PlanRequest",
     source: opt.Source | None = opt.SOURCE,
@@ -578,8 +591,14 @@ def shape(
         "Folder for the recording; of a launched application, for everything.",
         ...,
     ),
-    cycles: int = opt.CYCLES,
-    realtime: bool | None = opt.REALTIME,
+    cycles: int = opt.option(
+        "--cycles", "Cycles to record.", 320, min=1, rich_help_panel="A described application"
+    ),
+    realtime: bool | None = opt.option(
+        "--realtime/--no-realtime",
+        "Use SCHED_FIFO. Default: where it is permitted.",
+        rich_help_panel="A described application",
+    ),
     chain: list[str] | None = opt.option(
         "--chain FIRST..LAST",
         "The chain, by topics or nodes: /t1../t5. Several are shaped together. Default: you are"
@@ -590,9 +609,12 @@ def shape(
         "--throttle NODE:TOPIC=PERIOD",
         "A throttler before an input of NODE that is not quite periodic, from the first recording"
         " on (may be repeated).",
+        rich_help_panel=opt.EVIDENCE,
     ),
     period: int | None = opt.option(
-        "--period DURATION>0", "Period of a chain that no timer starts."
+        "--period DURATION>0",
+        "Period of a chain that no timer starts.",
+        rich_help_panel=opt.EVIDENCE,
     ),
     duration: int = opt.option(
         "--duration DURATION>0",
@@ -603,7 +625,12 @@ def shape(
     until: int | None = opt.UNTIL,
     source: opt.Source | None = opt.SOURCE,
     node: NodeChoice = opt.NODE,
-    backend: str = opt.option("--backend NAME", "As for `chainshaper apply`.", "auto"),
+    backend: str = opt.option(
+        "--backend NAME",
+        "As for `chainshaper apply`.",
+        "auto",
+        rich_help_panel=opt.IN_FORCE,
+    ),
     adapt: bool = opt.ADAPT,
     max_latency: int | None = opt.MAX_LATENCY,
     *,
