@@ -48,6 +48,8 @@ _PLAIN = {
     "μ": "u",
     "×": "x",
     "≤": "<=",
+    "✓": "+",
+    "✗": "x",
 }
 _LEAST_FOR_TABLES = 400_000_000
 """Bytes of address space below which Polars, as it loads, hangs or dies where it should say so."""

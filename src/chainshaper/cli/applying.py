@@ -43,6 +43,8 @@ def threads(
     running = cs.find_threads(plan if pid is None else pid, known, users=user or ())
     if out.present(json, threads_json(running), threads_table(running)):
         out.notes(running.notes)
+        if plan is not None:
+            out.next_step("chainshaper", "apply", str(where), "--dry-run")
 
 
 def apply(
@@ -100,6 +102,7 @@ def apply(
             if not changes.commands:
                 out.show(changes_table(changes.threads))
             out.notes((f"back end {changes.back_end}: {changes.reason}", *changes.notes))
+            out.next_step("chainshaper", "apply", plan)
         return
     out.warn(planned)
     with out.stop_on_signals() as stop, _watching() as (watch, report):
@@ -184,6 +187,7 @@ def status(
     if runs:
         states = (state for _, state in runs if state is not None)
         out.show(runs_table(runs), *map(servers_table, states))
+        out.next_step("chainshaper", "release", runs[0][0].name)
     elif not strays:
         out.show_line("no plan is in force")
     out.notes(line for journal, _ in runs for line in strange_lines(journal))
@@ -256,9 +260,10 @@ def doctor(
     json: bool = opt.JSON,
 ) -> None:
     """Examine this machine: scheduling, privileges, tracing, DDS, and its own stalls."""
-    from chainshaper.reporting.overviews import machine_json, machine_tables
+    from chainshaper.reporting.overviews import machine_json, machine_line, machine_tables
 
     with out.progress("examining this machine") as report:
         report(0.0, "watching for stalls")
         machine = cs.examine_machine(watch)
-    out.present(json, machine_json(machine), *machine_tables(machine))
+    if out.present(json, machine_json(machine), *machine_tables(machine)):
+        out.show_line(machine_line(machine))

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -78,6 +79,11 @@ def notes(lines: Iterable[str]) -> None:
     """Print what a reader of the figures must know on stderr, a line each."""
     for line in lines:
         say(f"note: {line}")
+
+
+def next_step(*words: str | Path) -> None:
+    """Say on stderr which command a user mostly wants behind this one."""
+    say(f"next: {shlex.join(map(str, words))}")
 
 
 def warn(plan: "cs.Plan") -> None:

@@ -110,6 +110,7 @@ def plan(
     if _print_plan(chain_plan, choice, warnings, json):
         for path in filter(None, (curve, output)):
             out.show_line(path)
+        _next_with(output)
 
 
 def _doubts_about(
@@ -173,6 +174,7 @@ def _convert(earlier: Path, output: Path | None, json: bool, *, alone: bool) -> 
     cs.save_plan(cs.convert_plan(earlier), output)
     if out.present(json, {"files": [str(output)]}):
         out.show_line(output)
+        _next_with(output)
 
 
 def _profile_of_latencies(
@@ -240,6 +242,15 @@ def _print_several(
         out.notes(warnings)
         for path in written:
             out.show_line(path)
+        _next_with(output)
+
+
+def _next_with(plan: Path | None) -> None:
+    """Say what comes behind planning: the plan is put in force, or first of all kept."""
+    if plan is None:
+        out.say("next: the same with `-o plan.yaml` keeps the plan")
+    else:
+        out.next_step("chainshaper", "apply", plan, "--dry-run")
 
 
 def sweep(
@@ -308,6 +319,7 @@ def sweep(
         out.notes(changing_nothing(frame, sweep_axes(frame)))
         for path in filter(None, (draw, output)):
             out.show_line(path)
+        out.next_step("chainshaper", "simulate", application, "-o", "simulated")
 
 
 def splice(

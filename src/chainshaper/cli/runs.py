@@ -134,6 +134,7 @@ def init(
 
     write_whole(new_file(output, opt.DESCRIPTIONS), [synthetic_chain().read_bytes()])
     out.show_line(output)
+    out.next_step("chainshaper", "run", output, "-o", "before")
 
 
 def run(
@@ -156,6 +157,7 @@ def run(
         )
     out.notes((f"skipped {WARM_UP_CYCLES} warm-up cycles", *recording.info.notes))
     out.show_line(recording.path)
+    out.next_step("chainshaper", "plan", recording.path, "-o", "plan.yaml")
 
 
 def simulate(
@@ -201,6 +203,7 @@ def simulate(
         for measurement in comparison.measurements:
             out.notes([f"{comparison.chain}: {verdict(measurement)[1]}"])
     out.show_line(recording.path)
+    out.next_step("chainshaper", "latency", recording.path)
 
 
 def generate(
@@ -219,6 +222,7 @@ def generate(
     value = {"package": output.name, "folder": str(output), "files": list(map(str, files))}
     if out.present(json, value):
         out.show_line(output)
+        out.next_step("colcon", "build", "--base-paths", output)
 
 
 def record(
@@ -264,11 +268,14 @@ def record(
             stop=stop,
             progress=out.stage_lines("record"),
         )
-    _show_recorded(recorded, json=json)
+    _show_recorded(recorded, "chains", json=json)
 
 
-def _show_recorded(recorded: "cs.Recorded", *, json: bool) -> None:
-    """Show what was recorded. Raises OperationError: the command ended with an error."""
+def _show_recorded(recorded: "cs.Recorded", *then: str, json: bool) -> None:
+    """Show what was recorded, and the command for it that comes ``then``.
+
+    Raises OperationError: the command ended with an error.
+    """
     from chainshaper.linux.child_processes import end_in_words
 
     recording = recorded.recording
@@ -286,6 +293,9 @@ def _show_recorded(recorded: "cs.Recorded", *, json: bool) -> None:
     if recorded.exit_code:
         ended = f"the command {end_in_words(recorded.exit_code)}"
         raise OperationError(f"{ended}; what was recorded until then is in {recording.path}")
+    if not json:
+        verb, *options = then
+        out.next_step("chainshaper", verb, recording.path, *options)
 
 
 def watch(
@@ -575,7 +585,7 @@ def profile(
             stop=stop,
             progress=out.stage_lines("record"),
         )
-    _show_recorded(recorded, json=json)
+    _show_recorded(recorded, "plan", "-o", "plan.yaml", json=json)
 
 
 @opt.takes_wishes(*opt.PLAN_WISHES)
@@ -712,6 +722,7 @@ def _show_shaped_recording(recording: "cs.Recording", *, strict: bool) -> None:
     out.notes(recording.info.notes)
     out.show_line(recording.path)
     judge(comparisons, strict=strict, json=False)
+    out.next_step("chainshaper", "report", recording.path, "-o", "report.html")
 
 
 def _show_shaped_launch(

@@ -33,6 +33,7 @@ def info(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
     if out.present(json, contents, *overviews.contents_table(recording)):
         out.show_line(out.lost_events(recording))
         out.notes((*contents["notes"], *(contradiction.note for contradiction in contradictions)))
+        out.next_step("chainshaper", "chains", *trace)
 
 
 def describe(
@@ -52,6 +53,7 @@ def describe(
         text, notes = application_file(recording, chain)
         out.notes(notes)
     out.show_line(write_whole(output, [text.encode()]))
+    out.next_step("chainshaper", "simulate", output, "-o", "simulated")
 
 
 def graph(
@@ -85,6 +87,7 @@ def graph(
         out.show(graph_drawing.application_table(chosen))
         out.show_line(out.lost_events(recording))
         out.notes(application.notes)
+        out.next_step("chainshaper", "chains", *trace)
     else:
         out.show_line(output.absolute())
         out.notes((*application.notes, out.lost_events(recording)))
@@ -102,6 +105,7 @@ def callbacks(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
     if out.present(json, rows, table):
         out.show_line(out.lost_events(recording))
         out.notes((*recording.info.notes, *flow.notes))
+        out.next_step("chainshaper", "chains", *trace)
     else:  # the JSON is an array, which has no place for notes
         out.notes(contradiction.note for contradiction in flow.contradictions)
         if any(recording.info.lost.values()):
@@ -136,6 +140,8 @@ def chains(
     if out.present(json, values, overviews.chain_table(application, listed)):
         out.show_line(f"{overviews.count_text(listed)}; {out.lost_events(recording)}")
         out.notes(remarks)
+        if listed.chains:
+            out.next_step("chainshaper", "latency", *trace, "--chain", listed.chains[0].spec)
 
 
 def latency(
@@ -163,6 +169,7 @@ def latency(
     if instances and not json:
         raise InputError("--instances goes with --json: add it")
     chain = chain if chains is None else named_chain(chains, chain)
+    named = () if chain is None else ("--chain", chain)
     with out.opened("latency", trace) as (recording, report):
         measurement = cs.measure_latency(recording, chain)
         drawn: tuple[Path, ...] = ()
@@ -180,6 +187,7 @@ def latency(
         for path in drawn:
             out.show_line(path)
         out.notes(analysis.notes)
+        out.next_step("chainshaper", "plan", *trace[:1], *named, "-o", "plan.yaml")
 
 
 def convert(trace: list[Path] = opt.TRACE, output: Path = opt.RECORDING_OUTPUT) -> None:
@@ -191,6 +199,7 @@ def convert(trace: list[Path] = opt.TRACE, output: Path = opt.RECORDING_OUTPUT) 
         written = cs.convert_recording(recording, output)
     out.show_line(written.path.absolute())
     out.notes((*written.info.notes, out.lost_events(written)))
+    out.next_step("chainshaper", "chains", output)
 
 
 FEW = 3  # more recordings than these get an overview
@@ -216,6 +225,7 @@ def budget(
     out.show_line(save_budget(proposed, output))
     if not chain:
         out.notes(taken_chain(recording, None, proposed.chains[0].chain))
+    out.next_step("chainshaper", "check", *trace[:1], "--budget", output)
 
 
 def _matching(recordings: list[Path]) -> list[Path]:
@@ -423,6 +433,8 @@ def compare(
     out.present(json, comparisons_json(comparisons), *comparison_tables(*comparisons))
     out.notes(taken_chains(comparisons, chain))
     judge(comparisons, strict=strict, json=json)
+    if not json:
+        out.next_step("chainshaper", "report", *recordings, "-o", "report.html")
 
 
 def report(
