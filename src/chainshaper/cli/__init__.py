@@ -73,7 +73,7 @@ def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
 def _run(arguments: list[str] | None, name: str) -> None:
     """As :func:`main`, but signals go on raising KeyboardInterrupt where they do so here."""
     from chainshaper.cli.output import say
-    from chainshaper.values.errors import ChainshaperError, shown
+    from chainshaper.values.errors import ChainshaperError
 
     _prepare_output_and_memory()
     _interrupted.clear()
@@ -97,9 +97,7 @@ def _run(arguments: list[str] | None, name: str) -> None:
         try:
             sys.exit(app(arguments, prog_name=name, standalone_mode=False))
         except USAGE_ERROR as error:
-            error.message = shown(error.message, but="\n")  # it may quote a file's name
-            error.show()
-            sys.exit(error.exit_code)
+            fail(_misuse_text(error, words, name), error.exit_code)
         except Abort:  # a question without an answer
             say("Aborted.")
             sys.exit(1)
@@ -127,6 +125,16 @@ def _run(arguments: list[str] | None, name: str) -> None:
         if message is None:
             raise
         fail(message, 1)
+
+
+def _misuse_text(error: Any, words: list[str], name: str) -> str:
+    """Say what is wrong with a command line, in the style of our own errors."""
+    if not words:
+        error.show()  # the help
+        sys.exit(error.exit_code)
+    help_of = name if error.ctx is None else error.ctx.command_path
+    message = error.format_message().rstrip(".")
+    return f"{message[:1].lower()}{message[1:]}: see `{help_of} --help`"
 
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

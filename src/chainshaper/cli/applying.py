@@ -39,8 +39,10 @@ def threads(
 
     pid = int(where) if where is not None and where.isdecimal() else None
     plan = None if where is None or pid is not None else cs.load_plan(where)
-    known = opt.recording_of(recording)
-    running = cs.find_threads(plan if pid is None else pid, known, users=user or ())
+    with out.late_progress("threads") as report:
+        report(0.0, "looking for nodes and their threads")
+        known = opt.recording_of(recording)
+        running = cs.find_threads(plan if pid is None else pid, known, users=user or ())
     if out.present(json, threads_json(running), threads_table(running)):
         out.notes(running.notes)
         if plan is not None:
@@ -93,9 +95,11 @@ def apply(
     opt.refuse_bound_alone(max_latency, adapt)
     known = opt.recording_of(recording)
     if dry_run:
-        changes = cs.planned_changes(
-            planned, backend, recording=known, phase_ns=phase, users=user or ()
-        )
+        with out.late_progress("apply") as report:
+            report(0.0, "looking for nodes and their threads")
+            changes = cs.planned_changes(
+                planned, backend, recording=known, phase_ns=phase, users=user or ()
+            )
         if out.present(json, asdict(changes)):
             for words in changes.commands:
                 out.show_line(shlex.join(words))
@@ -262,8 +266,10 @@ def doctor(
     """Examine this machine: scheduling, privileges, tracing, DDS, and its own stalls."""
     from chainshaper.reporting.overviews import machine_json, machine_line, machine_tables
 
-    with out.progress("examining this machine") as report:
-        report(0.0, "watching for stalls")
+    with (
+        out.progress("examining this machine") as report,
+        out.lasting(report, watch / 1e9, "watching for stalls"),
+    ):
         machine = cs.examine_machine(watch)
     if out.present(json, machine_json(machine), *machine_tables(machine)):
         out.show_line(machine_line(machine))

@@ -182,11 +182,12 @@ def simulate(
     from chainshaper.reporting.latency import verdict
 
     described = cs.load_application(application)
-    if execution_times is not None:
-        from chainshaper.simulation.simulating import with_recorded_times
-
-        described = with_recorded_times(described, execution_times, block=block)
     with out.late_progress(f"simulating {described.name}") as report:
+        if execution_times is not None:
+            from chainshaper.simulation.simulating import with_recorded_times
+
+            report(0.0, f"reading execution times from {execution_times}")
+            described = with_recorded_times(described, execution_times, block=block)
         recording = cs.simulate(
             described,
             output,
@@ -711,7 +712,8 @@ def _show_shaped_recording(recording: "cs.Recording", *, strict: bool) -> None:
     """Show what gates did in a recording of a described application, and judge it."""
     from chainshaper.verify.overruns import dropped_text, overruns_text
 
-    comparisons = cs.compare_chains([recording], least=1)
+    with out.late_progress("shape") as report:
+        comparisons = cs.compare_chains([recording], least=1, progress=report)
     for comparison in comparisons:
         about = f"{comparison.chain}: " if len(comparisons) > 1 else ""
         (measured,) = comparison.measurements

@@ -423,13 +423,16 @@ def compare(
     """
     from chainshaper.reporting.latency import comparisons_json
 
-    comparisons = cs.compare_chains(recordings, chain, opt.plan_in_force(plan))
-    if figures is not None:
-        from chainshaper.reporting.figures import draw_comparison
+    in_force = opt.plan_in_force(plan)
+    with out.late_progress("compare") as progress:
+        comparisons = cs.compare_chains(recordings, chain, in_force, progress=progress)
+        if figures is not None:
+            from chainshaper.reporting.figures import draw_comparison
 
-        if len(comparisons) > 1:
-            raise InputError("--figures draws one chain: name it with --chain")
-        draw_comparison(comparisons[0].measurements, figures)
+            if len(comparisons) > 1:
+                raise InputError("--figures draws one chain: name it with --chain")
+            progress(0.9, "drawing")
+            draw_comparison(comparisons[0].measurements, figures)
     out.present(json, comparisons_json(comparisons), *comparison_tables(*comparisons))
     out.notes(taken_chains(comparisons, chain))
     judge(comparisons, strict=strict, json=json)
