@@ -5,11 +5,18 @@ from typing import Any
 
 import pytest
 from command_line import called
-from known_run import known_run
 
+from chainshaper import load_application, simulate
 from chainshaper.cli.app import VERBS, app
 
 MOST_IN_FRONT = 9
+EXAMPLE = Path(__file__).parents[2] / "examples" / "synthetic_chain.yaml"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "before"
+    return simulate(load_application(EXAMPLE), folder, cycles=20, seed=1).path
 
 
 def options_in_panels(verb: str) -> dict[str, list[str]]:
@@ -35,13 +42,12 @@ def test_no_verb_has_many_options_in_front(verb: str) -> None:
     assert len(options_in_panels(verb).get("Options", [])) <= MOST_IN_FRONT
 
 
-def test_verbs_say_the_next_command_and_json_does_not(tmp_path: Path) -> None:
-    run = known_run(tmp_path / "known", 4).path
+def test_verbs_say_the_next_command_and_json_does_not(run: Path, tmp_path: Path) -> None:
     for words, then in (
         (("info", run), f"next: chainshaper chains {run}"),
         (("graph", run), f"next: chainshaper chains {run}"),
         (("callbacks", run), f"next: chainshaper chains {run}"),
-        (("chains", run), f"next: chainshaper latency {run} --chain /t1../t2"),
+        (("chains", run), f"next: chainshaper latency {run} --chain /t1../t5"),
         (("latency", run), f"next: chainshaper plan {run} -o plan.yaml"),
         (("plan", run), "next: the same with `-o plan.yaml` keeps the plan"),
         (("compare", run, run), f"next: chainshaper report {run} {run} -o report.html"),
@@ -56,11 +62,10 @@ def test_verbs_say_the_next_command_and_json_does_not(tmp_path: Path) -> None:
     "verb", ["info", "graph", "callbacks", "chains", "latency", "plan", "compare", "report"]
 )
 def test_no_verb_that_reads_a_recording_is_silent_for_long(
-    verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    verb: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With no patience at all, whatever takes a moment says what it does."""
     monkeypatch.setattr("chainshaper.cli.output.PATIENCE_S", 0.0)
-    run = known_run(tmp_path / "known", 4).path
     more: dict[str, tuple[str | Path, ...]] = {
         "compare": (run,),
         "report": ("-o", tmp_path / "report.html"),

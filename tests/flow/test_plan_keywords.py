@@ -15,7 +15,7 @@ from chainshaper import (
     simulate,
 )
 from chainshaper.planning.request import RequestKeywords
-from chainshaper.values.plan_choices import WishKeywords, Wishes
+from chainshaper.values.plan_choices import Wishes, WishKeywords
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "synthetic_chain.yaml"
 
