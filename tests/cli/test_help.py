@@ -47,7 +47,7 @@ def test_verbs_say_the_next_command_and_json_does_not(run: Path, tmp_path: Path)
         (("info", run), f"next: chainshaper chains {run}"),
         (("graph", run), f"next: chainshaper chains {run}"),
         (("callbacks", run), f"next: chainshaper chains {run}"),
-        (("chains", run), f"next: chainshaper latency {run} --chain /t1../t5"),
+        (("chains", run), f"next: chainshaper latency {run} --chain /t1../t2../t3../t4../t5"),
         (("latency", run), f"next: chainshaper plan {run} -o plan.yaml"),
         (("plan", run), "next: the same with `-o plan.yaml` keeps the plan"),
         (("compare", run, run), f"next: chainshaper report {run} {run} -o report.html"),
