@@ -10,13 +10,13 @@ import pytest
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "examples" / "notebooks").glob("*.ipynb"))
 
 
-def shown_values(notebook: Path) -> list[object]:
+def shown_values(notebook: Path) -> list[Any]:
     """Execute the code cells, as Jupyter does, and return the values that it would show.
 
     What is executed is Python without Jupyter's own commands; a kernel would only add processes.
     """
     names: dict[str, Any] = {"__name__": "__main__"}
-    values = []
+    values: list[Any] = []
     for number, cell in enumerate(json.loads(notebook.read_text(encoding="utf-8"))["cells"]):
         if cell["cell_type"] != "code":
             continue

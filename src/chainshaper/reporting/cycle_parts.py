@@ -28,8 +28,8 @@ class StackedCycles:
     @property
     def latency_ns(self) -> NDArray[np.int64]:
         """The latency of each cycle: the sum of all its parts."""
-        rows = (parts.sum(axis=1) for parts in self.parts_ns.values())
-        return np.sum([*rows], axis=0, dtype=np.int64)
+        rows = [parts.sum(axis=1) for parts in self.parts_ns.values()]
+        return np.asarray(np.sum(rows, axis=0), dtype=np.int64)
 
 
 def drawn_cycles(traversals: pl.DataFrame, limit: int) -> pl.DataFrame:
@@ -47,7 +47,8 @@ def drawn_cycles(traversals: pl.DataFrame, limit: int) -> pl.DataFrame:
     places = (latency.arg_min(), latency.arg_max())
     extremes = [groups.agg(pl.col("row").get(place))["row"] for place in places]
     sample = pl.arange(0, complete.height, -(-2 * complete.height // limit), eager=True)
-    return complete[pl.concat([*extremes, sample.cast(pl.UInt32)]).unique().sort()]
+    drawn: pl.DataFrame = complete[pl.concat([*extremes, sample.cast(pl.UInt32)]).unique().sort()]
+    return drawn
 
 
 def stacked_cycles(analysis: LatencyAnalysis, limit: int) -> StackedCycles:

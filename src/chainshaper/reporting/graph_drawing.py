@@ -198,7 +198,7 @@ class Time(NamedTuple):
 
     mean: float
     max: int
-    count: int
+    samples: int
 
     @property
     def text(self) -> str:
@@ -262,7 +262,7 @@ class _NodeBox:
                 f'<text class="small" x="{PAD + 14}" y="{top + 29}">{escape(function)}</text></g>',
             ]
             if (time := self.times.get(callback.id)) is not None:
-                parts.append(_time_text((width - PAD, top + 16), time.text, time.count))
+                parts.append(_time_text((width - PAD, top + 16), time.text, time.samples))
         return "\n".join([*parts, "</g>"])
 
 
@@ -320,20 +320,20 @@ def application_svg(application: ApplicationDescription, times: GraphTimes = NO_
         if arrow.time is not None:
             x, y = route[-1]
             mean, most = f"{ms(arrow.time.mean)} ms", f"max {ms(arrow.time.max)}"
-            parts.append(_time_text((x - 11, y - 5), mean, arrow.time.count))
-            parts.append(_time_text((x - 11, y + 13), most, arrow.time.count))
+            parts.append(_time_text((x - 11, y - 5), mean, arrow.time.samples))
+            parts.append(_time_text((x - 11, y + 13), most, arrow.time.samples))
     if any(application.lost.values()):
         y, text = layout.height + MARGIN / 2, escape(lost_text(application.lost))
         parts.append(f'<text class="small" x="0" y="{y:.1f}">{text}</text>')
     return "\n".join([*parts, "</svg>", ""])
 
 
-def _time_text(end: Point, text: str, count: int) -> str:
+def _time_text(end: Point, text: str, samples: int) -> str:
     """Draw a time that ends at a point; pointing at it says of how many it is."""
     x, y = end
     return (
         f'<text class="time" x="{x:.1f}" y="{y:.1f}" text-anchor="end">{text}'
-        f"<title>of {count}</title></text>"
+        f"<title>of {samples}</title></text>"
     )
 
 
@@ -364,8 +364,8 @@ def timed_graph_svg(flow: DataFlow, graph: ApplicationGraph, chain: Chain | None
     return application_svg(application, times)
 
 
-def _time(figures: Mapping[str, Any], count: int) -> Time:
-    return Time(figures["mean"], figures["max"], count)
+def _time(figures: Mapping[str, Any], samples: int) -> Time:
+    return Time(figures["mean"], figures["max"], samples)
 
 
 def _with_nodes_alone(
