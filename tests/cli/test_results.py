@@ -213,7 +213,7 @@ def test_a_promise_is_judged_in_one_line_and_an_exit_code(tmp_path: Path) -> Non
     broken = called("compare", after, before, "--plan", plan, "--strict")
     assert broken.code == 1
     assert "before: promise broken: jitter" in broken.out.splitlines()[-1]
-    assert broken.err == "error: the plan's promise is not met (--strict)\n"
+    assert broken.err.splitlines()[-1] == "error: the plan's promise is not met (--strict)"
     assert "name the plan in force" in called("compare", before, before, "--strict").err
     assert json_of("compare", before, after)["recordings"][1]["prediction"]["kept"] is True
     assert json_of("plan", before)["expected"]["jitter_ns"] == 100_000
