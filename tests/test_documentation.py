@@ -227,7 +227,7 @@ def test_pages_that_explain_are_short() -> None:
 
 def test_the_site_builds_without_warnings(tmp_path: Path) -> None:
     """It has every page in its navigation, and no link that leads nowhere."""
-    built = executed(f"mkdocs build --strict -q -d {tmp_path}", ROOT, tmp_path)
+    built = executed(f"mkdocs build --strict -d {tmp_path}", ROOT, tmp_path)
     assert built.code == 0, built.err
     verbs = re.findall(r"verbs/(\w+)\.md", (ROOT / "mkdocs.yml").read_text())
     assert verbs == " ".join(GROUPS.values()).split()
