@@ -39,12 +39,14 @@ def draw_claim(claim: Claim, runs: Sequence[Run], path: Path) -> Path:
         axes.set_title(COLUMNS[column], loc="left", fontsize=8)
         axes.tick_params(labelsize=7)
         axes.grid(alpha=0.3)
-        drawn = [run for name in claim.runs for run in runs if (run.name, run.column) == (name, column)]
-        for run, colour in zip(drawn, COLOURS[-len(claim.runs) :], strict=False):
-            latency = ended(run) / MS
+        drawn = {run.name: run for run in runs if run.column == column and run.name in claim.runs}
+        for name, colour in zip(claim.runs, COLOURS[-len(claim.runs) :], strict=False):
+            if name not in drawn:
+                continue
+            latency = ended(drawn[name]) / MS
             chosen = np.unique([*range(min(MOST, latency.size)), int(latency.argmax())])
             cycles = np.minimum(chosen, MOST)
-            axes.plot(cycles, latency[chosen], ".", markersize=2.5, color=colour, label=run.name)
+            axes.plot(cycles, latency[chosen], ".", markersize=2.5, color=colour, label=name)
         if not drawn:
             axes.text(0.5, 0.5, "not measured", ha="center", va="center", fontsize=8)
             axes.set_axis_off()

@@ -80,7 +80,9 @@ def main() -> None:
     ]
     reason = f"{ORIGIN} Bands chosen by `--bands auto`: {found['simulated'].reason}."
     notes = reason.replace("\n", " ")
-    save("figure_7", "Figure 7: average over bands", lines, runs=runs, pictures=pictures, notes=notes)
+    save(
+        "figure_7", "Figure 7: average over bands", lines, runs=runs, pictures=pictures, notes=notes
+    )
 
 
 if __name__ == "__main__":

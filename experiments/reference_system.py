@@ -60,7 +60,6 @@ from results import (
     Line,
     Run,
     Value,
-
     earlier_runs,
     figure,
     figures_of,

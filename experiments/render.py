@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from claim_pictures import draw_claims, pictures_of
-from claims import CLAIMS, MARKS, Claim, Judged, judged, verdict_of
+from claims import CLAIMS, MARKS, Claim, Judged, Verdict, judged, verdict_of
 from results import (
     COLUMNS,
     HERE,
@@ -55,34 +55,48 @@ SHARED = ("table_2", "table_3")
 NEAR_SHARE, SMALL, NEAR_SMALL = 0.05, 1.0, 0.05
 """A value is near the paper's within this share of it. What the paper has below 1 ms is a bound."""
 
+WORDS: Mapping[Verdict, str] = {
+    "holds": "holds",
+    "partly": "partly",
+    "not": "not",
+    "taken over": "follows from what was taken from the paper",
+}
+COUNTED: Mapping[Verdict, str] = {
+    "holds": "hold",
+    "partly": "hold partly",
+    "not": "do not",
+    "taken over": "are not tested by what we have",
+}
+
 HEAD = """# The paper's evaluation, and ours
 
 What the paper claims, and whether it holds here. Each claim is judged by its own ratio, within one
-column, over **all cycles** that came to an end: late ones, and those that a stall of the machine hit,
-are in every number of this table. {marks}.
+column, over **all cycles** that came to an end: late ones, and those that a stall of the machine
+hit, are in every number of this table. {marks}.
 
 {verdicts}
 """
 
 ABOUT = f"""
-* **simulated** has 2,000 to 10,000 cycles, **live** the same chains over Cyclone DDS, by nodes of our
-  own, **ROS 2** generated C++ nodes that `ros2 launch` starts and the one command shapes.
-* {MARK} follows from what was taken from the paper (its slots, or execution times that were fitted to
-  its numbers): no evidence, and not part of the verdict.
+* **simulated** has 2,000 to 10,000 cycles, **live** the same chains over Cyclone DDS, by nodes of
+  our own, **ROS 2** generated C++ nodes that `ros2 launch` starts and the one command shapes.
+* {MARK} follows from what was taken from the paper (its slots, or execution times that were fitted
+  to its numbers): no evidence, and not part of the verdict. What does not come out as the paper's
+  all the same, counts.
 * **Machines** are virtual machines with two cores that others share; each row has values of one of
-  them alone: {{machines}}. The paper's has 16 cores at 3.7 GHz; neither the drive and localizer of its
-  valet parking nor its execution times are published: ours are another localizer (live) and drawn
-  times (simulated and ROS 2).
+  them alone: {{machines}}. The paper's has 16 cores at 3.7 GHz; neither the drive and localizer of
+  its valet parking nor its execution times are published: ours are another localizer (live) and
+  drawn times (simulated and ROS 2).
 * **Never run**: LITMUS^RT's kernel, which the paper has, and sched_ext outside a virtual machine.
   Servers are in force here by freezing threads on a stock kernel. In all runs of this table the
   chain's server R_m stays open until the chain is done; [closed where eq. 1 ends
   it](#both-servers-in-force-strictly), it has a table of its own.
-* An effect holds if it is as large as the paper's less a tenth (half of it: partly); a price if it is
-  no larger than the paper's and a tenth (twice: partly), at least half a percent point; constant is a
-  jitter within the paper's, to its one digit (partly: 95 % of all outputs within it).
+* An effect holds if it is as large as the paper's less a tenth (half of it: partly); a price if it
+  is no larger than the paper's and a tenth, at least half a percent point (twice: partly); constant
+  is a jitter within the paper's, to its one digit (partly: 95 % of all outputs within it).
 
-`python experiments/render.py --page` computes every number on this page again, from the latencies of
-every cycle in `results/`; `docs/experiments.md` says how they are measured.
+`python experiments/render.py --page` computes every number on this page again, from the latencies
+of every cycle in `results/`; `docs/experiments.md` says how they are measured.
 """
 
 TABLES = f"""
@@ -90,8 +104,9 @@ TABLES = f"""
 
 A value is that of **all cycles**, in parentheses 95 % of the values when cycles are drawn again
 (bootstrap); behind it, where it is another one, that of `calm` cycles, which no stall disturbed and
-whose output was not late. `received` is until the callback of the output's receiver begins; measured
-runs before 2026-11-28 did not keep it. {MARK} as above. Each row has measured values of one machine.
+whose output was not late. `received` is until the callback of the output's receiver begins: what
+was measured before 2026-11-28 did not keep it. {MARK} as above. A row has measured values of one
+machine.
 """
 
 
@@ -151,9 +166,9 @@ def _head(runs: Mapping[str, Sequence[Run]], letters: Mapping[str, str]) -> Iter
     }
     verdicts = {key: _verdict(numbers) for key, numbers in found.items()}
     said = [*verdicts.values()]
-    counts = ", ".join(f"{said.count(verdict)} {_word(verdict)}" for verdict in MARKS)
-    marks = ", ".join(f"{mark} {_word(verdict)}" for verdict, mark in MARKS.items())
-    text = f"Of {len(said)} claims: {counts}."
+    counts = ", ".join(f"{said.count(verdict)} {words}" for verdict, words in COUNTED.items())
+    marks = ", ".join(f"{mark} {WORDS[verdict]}" for verdict, mark in MARKS.items())
+    text = f"**Of {len(said)} claims {counts}.**"
     yield HEAD.format(marks=marks[0].upper() + marks[1:], verdicts=text)
     titles = " | ".join(COLUMNS[column] for column in OURS)
     yield f"| the paper's claim | paper | {titles} | on | holds? |"
@@ -165,11 +180,7 @@ def _head(runs: Mapping[str, Sequence[Run]], letters: Mapping[str, str]) -> Iter
     yield from _pictures()
 
 
-def _word(verdict: str) -> str:
-    return {"taken over": "taken over: not tested"}.get(verdict, verdict)
-
-
-def _verdict(found: Mapping[Column, Sequence[Judged]]) -> Any:
+def _verdict(found: Mapping[Column, Sequence[Judged]]) -> Verdict:
     return verdict_of([number for numbers in found.values() for number in numbers])
 
 
@@ -181,10 +192,9 @@ def _claim(
 ) -> Iterator[str]:
     """The rows of a claim: one for each machine that it was measured on."""
     verdict = _verdict(found)
-    names = set(claim.runs)
-    where = machines_of(run for run in runs if not names or run.name in names)
+    where = {of: text for of, text in machines_of(runs).items() if of in found}
     first = [f"**{claim.name}** ({claim.source})", claim.paper]
-    last = f"{MARKS[verdict]} **{_word(verdict)}**: {claim.why}"
+    last = f"{MARKS[verdict]} **{WORDS[verdict]}**: {claim.why}"
     for number, (letter, columns) in enumerate(_by_machine(where, letters)):
         shown = [*columns, "simulated"] if number == 0 else columns
         cells = [_numbers(found[of]) if of in found and of in shown else "" for of in OURS]
@@ -203,7 +213,8 @@ def _by_machine(
 
 
 def _numbers(numbers: Sequence[Judged]) -> str:
-    return "; ".join(f"{MARKS[one.verdict]} {one.text}" for one in numbers)
+    marked = (f"{MARKS[one.verdict]} {one.text}" if one.verdict else one.text for one in numbers)
+    return "; ".join(marked)
 
 
 def _pictures() -> Iterator[str]:
@@ -324,8 +335,9 @@ def _runs(runs: Sequence[Run], letters: Mapping[str, str]) -> Iterator[str]:
     if any("under way" in without_end(run) for run in runs):
         yield (
             "\nUnder way: all these cycles are the last of their block. A recording on ROS 2 ends by"
-            " the time, after 4 s for starting the nodes and as many periods as cycles are wanted;"
-            " nodes that start for longer leave fewer cycles, and what is under way comes to no end."
+            " the clock, after 4 s for starting the nodes and as many periods as cycles are wanted:"
+            " nodes that take longer to start leave fewer cycles, and what is under way as it ends"
+            " comes to no end."
         )
 
 
@@ -339,7 +351,7 @@ def without_end(run: Run) -> str:
         ended = [not one for one in lost[run.blocks == block]]
         at_ends += next((n for n, one in enumerate(reversed(ended)) if one), len(ended))
     count = int(lost.sum())
-    return f"{count}, under way at the end" if at_ends == count else f"{count}, {at_ends} of them under way"
+    return f"{count}, {'' if at_ends == count else f'{at_ends} of them '}under way at the end"
 
 
 def main() -> None:

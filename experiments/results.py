@@ -49,7 +49,6 @@ __all__ = [
     "lines_from",
     "lines_of",
     "machines_of",
-
     "save",
     "value_text",
 ]
@@ -119,12 +118,13 @@ class Line:
 class Run:
     """The end-to-end latencies of one configuration, in the order of time.
 
-    ``latency_ns`` is −1 where a cycle came to no end (lost, discarded, merged with another), and
-    ``reception_ns``, until the callback of the output's receiver begins, −1 where none did; None if
-    nobody received, or it was not kept. ``facts`` are numbers of the run that are no figures of its
-    cycles, and its slots. ``disturbed`` marks cycles that the machine disturbed, none of them in a simulation. ``block``
+    ``latency_ns`` is −1 where a cycle came to no end (lost, discarded, merged with another);
+    ``disturbed`` marks cycles that the machine disturbed, none of them in a simulation. ``block``
     counts the stretches in which a configuration took turns with others; ``repeats`` of these were
     measured again, because the machine stood still. ``measured`` is when and where: as it is saved.
+    ``reception_ns`` is the latency until the callback of the output's receiver begins, −1 where
+    none did; None if nobody received, or it was not kept. ``facts`` are numbers of the run that are
+    no figures of its cycles, and its slots.
     """
 
     name: str
@@ -265,7 +265,9 @@ def earlier_runs(name: str, *columns: Column, folder: Path = RESULTS) -> list[Ru
     rows, runs = pl.read_parquet(path.with_suffix(".parquet")), []
     for about in json.loads(path.read_text())["runs"]:
         if about["column"] in columns:
-            cycles = rows.filter(pl.col("column") == about["column"], pl.col("run") == about["name"])
+            cycles = rows.filter(
+                pl.col("column") == about["column"], pl.col("run") == about["name"]
+            )
             latency, disturbed, block = (
                 cycles[key].to_numpy() for key in ("latency_ns", "disturbed", "block")
             )

@@ -4,19 +4,21 @@
 
 By default a server that runs a chain stays open until the chain is done. The paper's servers are
 open in their slots only; here they are (``slot_ends: closed``), live by freezing threads. Beside
-each stands the same plan with servers that stay open, and beside each jitter at the publication that
-at the receiver: until the callback of the actuator begins.
+each stands the same plan with servers that stay open, and beside each jitter at the publication
+that at the receiver: until the callback of the actuator begins.
 
 Designs 1 to 3, LET, and the time-driven servers of table 1. The chain is that of section 5.2, with
-its execution times of 5 to 12 ms; time-driven servers have table 1's, of 5 to 15 ms, under a load of
-40 ms. Plans are made from a profile that is as long as a live run, with slots as in the paper's:
-R_m ends on the next whole ms behind the profile's longest cycle. All runs draw other execution times
-than the profile's: a cycle may be longer than R_m, and what that costs is what the servers differ in.
+its execution times of 5 to 12 ms; time-driven servers have table 1's, of 5 to 15 ms, under a load
+of 40 ms. Plans are made from a profile of 200 cycles, with slots as in the paper's: R_m ends on the
+next whole ms behind the profile's longest cycle. All runs draw other execution times than the
+profile's: a cycle may be longer than R_m, and what that costs is what the servers differ in.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import figure_8
 import table_1
@@ -27,17 +29,18 @@ from configurations import (
     Panel,
     block_seed,
     draw_latencies,
+    latencies_of,
     live,
     live_in_turns,
+    output_of,
     parse_options,
     simulated,
 )
-from results import COLUMNS, MS, PICTURES, Column, Line, Run, Value, earlier_runs, lines_of, save
+from results import COLUMNS, MS, PICTURES, Line, Run, Value, earlier_runs, lines_of, save
 
-from chainshaper import load_application
-from chainshaper.planning import ChainPlan, plan_shaping
-from chainshaper.planning.bands import with_bands
-from chainshaper.planning.shaping import let_per_callback, let_per_chain
+from chainshaper import load_application, plan_recording, simulate
+from chainshaper.planning import ChainPlan, PlanRequest
+from chainshaper.planning.chain_plan import revised
 from chainshaper.values.plan_choices import SlotEnds
 from chainshaper.workload.description import Application
 
@@ -62,9 +65,15 @@ WHY = {
     OPEN: "",
     CLOSED: "what is not done as R_m closes goes on in the next cycle's slot, and takes its time",
 }
-SLOTS: dict[Column, str] = dict.fromkeys(
-    ("simulated", "live"), "the slots are as the paper's, or follow from the chosen execution times"
-)
+WHY_SLOTS = "the slots are the paper's, or follow from execution times chosen to fit its maximum"
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What plans are made from."""
+
+    recording: Path
+    run: Run
 
 
 def applications() -> dict[str, Application]:
@@ -73,58 +82,48 @@ def applications() -> dict[str, Application]:
     return dict(zip(UNSHAPED, (*times, table_5.synthetic()), strict=True))
 
 
-def shaped(profile: Run) -> ChainPlan:
-    """One band of the synchronous chain: R_m ends on the next whole ms behind the longest."""
-    longest = int(profile.undisturbed_ns.max())
-    return plan_shaping(
-        profile.undisturbed_ns,
-        PERIOD_NS,
-        spec="/node1../t5",
-        output="/t5",
-        publisher=figure_8.NODES[-1],
-        nodes=figure_8.NODES,
-        epsilon_ns=-(-longest // MS) * MS - longest,
-        overrun="wait",
-        core=1,
-    )
-
-
-def plans(profiles: Sequence[Run]) -> Iterator[tuple[str, str, ChainPlan]]:
-    """Each design's name, that of its unshaped run, and its plan; servers stay open."""
-    five, asynchronous, synchronous = profiles
-    one = shaped(synchronous)
-    made = {
-        "five time-driven servers": table_1.five_servers(five.undisturbed_ns),
-        "design 1, asynchronous": figure_8.plan_with_slot(asynchronous.undisturbed_ns, 10),
-        "design 2, one band": one,
-        "design 3, three bands": with_bands(one, synchronous.undisturbed_ns, 3, grid_ns=MS),
-        "LET per callback": let_per_callback(one, table_5.TOPICS["synthetic"]),
-        "LET per chain": let_per_chain(one),
+def plans(profiles: Sequence[Profile]) -> dict[str, tuple[str, ChainPlan]]:
+    """The unshaped run and the plan of each design, with servers that stay open."""
+    five, asynchronous, chain = profiles
+    longest = int(chain.run.undisturbed_ns.max())
+    wishes = PlanRequest(epsilon_ns=-(-longest // MS) * MS - longest, overrun="wait")
+    of_chain = {
+        "design 2, one band": wishes,
+        "design 3, three bands": replace(wishes, bands=3, grid_ns=MS),
+        "LET per callback": PlanRequest(policy="let-per-callback"),
+        "LET per chain": PlanRequest(policy="let-per-chain"),
     }
-    for name, plan in made.items():
-        of = UNSHAPED[0] if "five" in name else UNSHAPED[1] if "design 1" in name else UNSHAPED[2]
-        yield name, of, plan
+    one_slot = figure_8.plan_with_slot(asynchronous.run.undisturbed_ns, 10)
+    return {
+        "five time-driven servers": (UNSHAPED[0], table_1.five_servers(five.run.undisturbed_ns)),
+        "design 1, asynchronous": (UNSHAPED[1], one_slot),
+    } | {
+        name: (UNSHAPED[2], plan_recording(chain.recording, request=request).chains[0])
+        for name, request in of_chain.items()
+    }
 
 
-def configurations(profiles: Sequence[Run]) -> list[Configuration]:
+def configurations(profiles: Sequence[Profile]) -> list[Configuration]:
     """All unshaped applications, and each design with servers that stay open and that close."""
     described = applications()
     made = [Configuration(name, application) for name, application in described.items()]
-    for name, unshaped, plan in plans(profiles):
+    for design, (unshaped, plan) in plans(profiles).items():
         for ends, slot_ends in ENDS.items():
-            own = plan.model_copy(update={"slot_ends": slot_ends})
-            made.append(Configuration(f"{name}, {ends}", described[unshaped], own))
+            own = revised(plan, slot_ends=slot_ends)
+            made.append(Configuration(f"{design}, {ends}", described[unshaped], own))
     return made
 
 
 def run_simulated(options: Options) -> list[Run]:
     """All by simulation, with other execution times than the profiles'."""
-    profiles = [
-        simulated(name, application, cycles=2 * options.cycles)
-        for name, application in applications().items()
-    ]
-    runs = []
-    for one in configurations(profiles):
+    profiles, runs = [], []
+    with TemporaryDirectory() as folder:
+        for name, application in applications().items():
+            recording = output_of(Path(folder), name)
+            profile = simulate(application, recording, cycles=2 * options.cycles)
+            profiles.append(Profile(recording, latencies_of(name, profile)))
+        compared = configurations(profiles)
+    for one in compared:
         others = one.application.model_copy(update={"seed": block_seed(one.application, 0)})
         runs.append(simulated(one.name, others, one.plan, cycles=options.simulated_cycles))
     return runs
@@ -132,12 +131,11 @@ def run_simulated(options: Options) -> list[Run]:
 
 def run_live(options: Options) -> list[Run]:
     """All live, in turns, planned from profiles before."""
-    profiles = [
-        live(
-            f"profile, {name}", application, cycles=2 * options.cycles, folder=options.keep
-        )
-        for name, application in applications().items()
-    ]
+    profiles = []
+    for name, application in applications().items():
+        profile = f"profile of {name}"
+        run = live(profile, application, cycles=2 * options.cycles, folder=options.keep)
+        profiles.append(Profile(output_of(options.keep, profile), run))
     return live_in_turns(
         configurations(profiles), cycles=options.cycles, folder=options.keep, blocks=BLOCKS
     )
@@ -151,21 +149,28 @@ def lines(runs: Sequence[Run]) -> list[Line]:
         made += lines_of(name, runs, figures)
     for design, (maximum, jitter, late_ms) in DESIGNS.items():
         for ends in ENDS:
-            figures = {"maximum": maximum, "jitter": jitter, "late": None}
-            made += lines_of(
-                *(f"{design}, {ends}", runs, figures),
-                late_from_ns=late_ms * MS,
-                why=WHY[ends],
-                no_evidence=SLOTS,
-            )
+            for what, paper, marks in (
+                ("maximum", maximum, dict.fromkeys(("simulated", "live"), WHY_SLOTS)),
+                ("jitter", jitter, {"simulated": WHY_SLOTS}),
+                ("late", None, {}),
+            ):
+                made += lines_of(
+                    *(f"{design}, {ends}", runs, {what: paper}),
+                    late_from_ns=late_ms * MS,
+                    why=WHY[ends],
+                    no_evidence={} if paper is None else marks,
+                )
     return made
 
 
 NOTES = (
-    "Live rows are measured by `flock /tmp/machine.lock python experiments/strict_servers.py`, as root,"
-    " on a machine with nothing else to do: ten minutes. A dash is what was not measured. On ROS 2"
-    " nothing of this is: `chainshaper shape --slot-ends closed --backend freezer … -- ros2 launch …`"
-    " would."
+    "Live, servers close by freezing threads (`python experiments/strict_servers.py`, as root, on a"
+    " machine with nothing else to do: ten minutes). On ROS 2 none of this is measured; it would be"
+    " by `chainshaper shape --slot-ends closed --backend freezer … -- ros2 launch …`.\n\n"
+    "The plans know 200 cycles, and run others, of which some are longer. R_m that stays open costs"
+    " such a cycle its own output; R_m that closes may cost those behind it too, as what is left"
+    " takes the time of the next cycle. What closing buys is a smaller jitter of outputs in their"
+    " own cycle: a cycle that is a little too long does not end in the open publish slot."
 )
 
 

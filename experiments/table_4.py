@@ -165,7 +165,9 @@ def lines(runs: Sequence[Run]) -> list[Line]:
             texts[column], means[column] = slots_text(plans_of[row]), average(plans_of[row])
         if row == ROW_1:
             texts["live"] = row_1["live"].facts.get("slots") if "live" in row_1 else None
-            means |= {column: figure("average", run.undisturbed_ns) for column, run in row_1.items()}
+            means |= {
+                column: figure("average", run.undisturbed_ns) for column, run in row_1.items()
+            }
         about: dict[str, Any] = {"why": WHY.get(row, ""), "machines": machines_of(runs)}
         about["no_evidence"] = OF_TABLE_2 if row == ROW_1 else FITTED
         made.append(Line(f"{row}: slots", "ms", slots, **texts, **about))
