@@ -334,10 +334,10 @@ def _runs(runs: Sequence[Run], letters: Mapping[str, str]) -> Iterator[str]:
         yield f"| {run.name} | {COLUMNS[run.column]} | {counts} | {day}{place} |"
     if any("under way" in without_end(run) for run in runs):
         yield (
-            "\nUnder way: all these cycles are the last of their block. A recording on ROS 2 ends by"
-            " the clock, after 4 s for starting the nodes and as many periods as cycles are wanted:"
-            " nodes that take longer to start leave fewer cycles, and what is under way as it ends"
-            " comes to no end."
+            "\nUnder way: all these cycles are the last of their block. A recording on ROS 2 ends"
+            " by the clock, after 4 s for starting the nodes and as many periods as cycles are"
+            " wanted: nodes that take longer to start leave fewer cycles, and what is under way as"
+            " it ends comes to no end."
         )
 
 

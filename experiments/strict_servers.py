@@ -1,6 +1,6 @@
 """Both servers in force, strictly: R_m closes where eq. 1 ends it (no table of the paper).
 
-    python experiments/strict_servers.py [--simulated] [--cycles 100] [--keep FOLDER]
+    python experiments/strict_servers.py [--simulated] [--cycles 80] [--keep FOLDER]
 
 By default a server that runs a chain stays open until the chain is done. The paper's servers are
 open in their slots only; here they are (``slot_ends: closed``), live by freezing threads. Beside
@@ -49,7 +49,7 @@ LOAD_MS = 40
 CLOSED, OPEN = "closed", "open until done"
 ENDS: dict[str, SlotEnds] = {OPEN: "open-until-done", CLOSED: "closed"}
 
-BLOCKS = 2
+BLOCKS, PROFILE_CYCLES = 2, 200
 
 DESIGNS: dict[str, tuple[Value, Value, int]] = {  # the paper's maximum and jitter, late from (ms)
     "five time-driven servers": ("≈ 80", "≈ 10", 100),
@@ -120,7 +120,7 @@ def run_simulated(options: Options) -> list[Run]:
     with TemporaryDirectory() as folder:
         for name, application in applications().items():
             recording = output_of(Path(folder), name)
-            profile = simulate(application, recording, cycles=2 * options.cycles)
+            profile = simulate(application, recording, cycles=PROFILE_CYCLES)
             profiles.append(Profile(recording, latencies_of(name, profile)))
         compared = configurations(profiles)
     for one in compared:
@@ -134,7 +134,7 @@ def run_live(options: Options) -> list[Run]:
     profiles = []
     for name, application in applications().items():
         profile = f"profile of {name}"
-        run = live(profile, application, cycles=2 * options.cycles, folder=options.keep)
+        run = live(profile, application, cycles=PROFILE_CYCLES, folder=options.keep)
         profiles.append(Profile(output_of(options.keep, profile), run))
     return live_in_turns(
         configurations(profiles), cycles=options.cycles, folder=options.keep, blocks=BLOCKS
@@ -176,7 +176,7 @@ NOTES = (
 
 def main() -> None:
     with ExitStack() as until:
-        options = parse_options(__doc__, cycles=100, until=until)
+        options = parse_options(__doc__, cycles=80, until=until)
         runs = run_simulated(options)
         runs += run_live(options) if options.live else earlier_runs("strict_servers", "live")
     pictures = [
