@@ -51,7 +51,7 @@ def lines(runs: Sequence[Run]) -> list[Line]:
         values |= {of: curve[bands - 1] for of, curve in curves.items() if len(curve) >= bands}
         what = f"{bands} band{'s' if bands > 1 else ''}: average"
         said = PAPER.get(bands, "negligible change" if bands > 4 else None)
-        about = {"no_evidence": FITTED, "machines": machines_of(runs)}
+        about: dict[str, Any] = {"no_evidence": FITTED, "machines": machines_of(runs)}
         made.append(Line(what, "ms", said, **values, **about))
     return made
 

@@ -36,7 +36,7 @@ from configurations import (
     parse_options,
     simulated,
 )
-from results import COLUMNS, MS, PICTURES, Line, Run, Value, earlier_runs, lines_of, save
+from results import COLUMNS, MS, PICTURES, Column, Line, Run, Value, earlier_runs, lines_of, save
 
 from chainshaper import load_application, plan_recording, simulate
 from chainshaper.planning import ChainPlan, PlanRequest
@@ -66,6 +66,10 @@ WHY = {
     CLOSED: "what is not done as R_m closes goes on in the next cycle's slot, and takes its time",
 }
 WHY_SLOTS = "the slots are the paper's, or follow from execution times chosen to fit its maximum"
+SLOTS: dict[str, dict[Column, str]] = {
+    "maximum": {"simulated": WHY_SLOTS, "live": WHY_SLOTS},
+    "jitter": {"simulated": WHY_SLOTS},
+}
 
 
 @dataclass(frozen=True)
@@ -149,16 +153,13 @@ def lines(runs: Sequence[Run]) -> list[Line]:
         made += lines_of(name, runs, figures)
     for design, (maximum, jitter, late_ms) in DESIGNS.items():
         for ends in ENDS:
-            for what, paper, marks in (
-                ("maximum", maximum, dict.fromkeys(("simulated", "live"), WHY_SLOTS)),
-                ("jitter", jitter, {"simulated": WHY_SLOTS}),
-                ("late", None, {}),
-            ):
+            figures = {"maximum": maximum, "jitter": jitter, "late": None}
+            for what, paper in figures.items():
                 made += lines_of(
                     *(f"{design}, {ends}", runs, {what: paper}),
                     late_from_ns=late_ms * MS,
                     why=WHY[ends],
-                    no_evidence={} if paper is None else marks,
+                    no_evidence=None if paper is None else SLOTS.get(what),
                 )
     return made
 
