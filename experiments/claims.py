@@ -377,7 +377,7 @@ CLAIMS = (
         "table_3",
         within_bands,
         "an output that comes while its slot of 1 ms is open leaves at once, and fills the slot;"
-        " `--into-open-slot next` has it wait",
+        " `--into-open-slot next-slot` has it wait",
         (PSO,),
     ),
     Claim(

@@ -41,6 +41,7 @@ from results import COLUMNS, MS, PICTURES, Column, Line, Run, Value, earlier_run
 from chainshaper import load_application, plan_recording, simulate
 from chainshaper.planning import ChainPlan, PlanRequest
 from chainshaper.planning.chain_plan import revised
+from chainshaper.values.errors import OperationError
 from chainshaper.values.plan_choices import SlotEnds
 from chainshaper.workload.description import Application
 
@@ -139,6 +140,11 @@ def run_live(options: Options) -> list[Run]:
     for name, application in applications().items():
         profile = f"profile of {name}"
         run = live(profile, application, cycles=PROFILE_CYCLES, folder=options.keep)
+        if not run.undisturbed_ns.size:
+            raise OperationError(
+                f"{profile}: the machine disturbed each of {run.latency_ns.size} cycles, so that"
+                " nothing can be planned: run this where nothing else does"
+            )
         profiles.append(Profile(output_of(options.keep, profile), run))
     return live_in_turns(
         configurations(profiles), cycles=options.cycles, folder=options.keep, blocks=BLOCKS
@@ -165,9 +171,11 @@ def lines(runs: Sequence[Run]) -> list[Line]:
 
 
 NOTES = (
-    "Live, servers close by freezing threads (`python experiments/strict_servers.py`, as root, on a"
-    " machine with nothing else to do: ten minutes). On ROS 2 none of this is measured; it would be"
-    " by `chainshaper shape --slot-ends closed --backend freezer … -- ros2 launch …`.\n\n"
+    "**Not measured live, nor on ROS 2.** Live, servers close by freezing threads; the command is"
+    " `python experiments/strict_servers.py`, as root, on a machine with nothing else to do: ten"
+    " minutes. On 2026-11-28 other work filled the machine: each of 600 cycles of the profiles was"
+    " disturbed, and nothing can be planned from that. On ROS 2 it is `chainshaper shape --slot-ends"
+    " closed --backend freezer … -- ros2 launch …`.\n\n"
     "The plans know 200 cycles, and run others, of which some are longer. R_m that stays open costs"
     " such a cycle its own output; R_m that closes may cost those behind it too, as what is left"
     " takes the time of the next cycle. What closing buys is a smaller jitter of outputs in their"

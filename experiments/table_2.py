@@ -37,7 +37,7 @@ CALLBACKS = {
 """Nodes, and topics where a node has several callbacks; fusion's inputs count as one."""
 
 WHY = {
-    "throttler, rear": "",
+    "throttler, rear": "live, other work filled the machine, which slows caches and CPU time down",
     "throttler, front": "",
     "rear filter": "live: its time is that of outlier removal, so of how many points are seen",
     "front filter": "live: as the rear filter; denser scans leave a slow machine no room in 100 ms",

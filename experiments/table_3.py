@@ -81,7 +81,10 @@ class Row:
 
 
 WHY_LIVE = "live is another localizer on another machine: compare with its own first row"
-WHY_AGAIN = "the simulator delivers and takes clouds as fast as small messages"
+WHY_AGAIN = (
+    "the simulator delivers and takes clouds as fast as small messages, and has no other work: live"
+    " was measured while that filled the machine, and disturbed 271 of 275 cycles"
+)
 WHY_LATE = (
     "late are outputs of cycles in which something took longer than ever in the profile and its"
     " margin, and those behind them; " + WHY_LIVE
