@@ -88,9 +88,9 @@ ABOUT = f"""
   its valet parking nor its execution times are published: ours are another localizer (live) and
   drawn times (simulated and ROS 2).
 * **Never run**: LITMUS^RT's kernel, which the paper has, and sched_ext outside a virtual machine.
-  Servers are in force here by freezing threads on a stock kernel. In all runs of this table the
-  chain's server R_m stays open until the chain is done; [closed where eq. 1 ends
-  it](#both-servers-in-force-strictly), it has a table of its own.
+  Servers are in force here by freezing threads on a stock kernel. In the runs of this table the
+  chain's server R_m stays open until the chain is done, but for the one server of valet parking's
+  chain; [closed where eq. 1 ends it](#both-servers-in-force-strictly), it has a table of its own.
 * An effect holds if it is as large as the paper's less a tenth (half of it: partly); a price if it
   is no larger than the paper's and a tenth, at least half a percent point (twice: partly); constant
   is a jitter within the paper's, to its one digit (partly: 95 % of all outputs within it).
