@@ -224,7 +224,7 @@ CLAIMS = (
         "A server per callback instead of priorities: jitter −72 %, maximum +27 %",
         "table 1, section 2.5",
         "Nevertheless, due to such constrained progress in the chain’s execution, J1 reduces to"
-        " reflect only the response time variation of the last callback in ch1.",
+        " reflect only the response time variation of the chain’s last callback.",
         "jitter 36.2 → ≈ 10 ms, maximum 62.8 → ≈ 80 ms (load 40 ms)",
         "table_1",
         two_runs(
