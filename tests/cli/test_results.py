@@ -202,7 +202,9 @@ def test_a_promise_is_judged_in_one_line_and_an_exit_code(tmp_path: Path) -> Non
     application = Path(__file__).parents[2] / "examples" / "synthetic_chain.yaml"
     before, after, plan = tmp_path / "before", tmp_path / "after", tmp_path / "plan.yaml"
     assert called("simulate", application, "-o", before).code == 0
-    printed = called("plan", before, "-o", plan).out
+    planned = called("plan", before, "-o", plan)
+    assert planned.code == 0, planned.err
+    printed = planned.out
     assert "outputs leave at" in printed
     assert "expected jitter 0.1" in printed
     assert called("simulate", application, plan, "-o", after).code == 0
