@@ -113,7 +113,10 @@ def __getattr__(name: str) -> Any:
         return sorted(_homes())
     from importlib import import_module
 
+    from chainshaper.vendored_packages import use_vendored
+
     home = _homes().get(name)
     if home is None:
         raise AttributeError(f"module 'chainshaper' has no attribute {name!r}")
+    use_vendored()
     return getattr(import_module(home), name)

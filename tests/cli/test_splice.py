@@ -168,8 +168,8 @@ def test_types_are_those_of_the_recording_that_saw_them(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("PLAN -o DIR", "give a plan and the launch files"),
-        ("-o DIR", "give a plan and the launch files"),
+        ("PLAN -o DIR --dry-run", "a dry run needs the launch files"),
+        ("-o DIR", "give a plan, and the launch files"),
         ("PLAN ROBOT -o DIR --build --node python", "--node python needs no building"),
         ("PLAN ROBOT -o DIR --node cpp --type Header", "'Header' is not a message type"),
         ("ROBOT -o DIR --throttle /t1=100ms", "is not known: name a recording of the application"),
