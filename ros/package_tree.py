@@ -3,8 +3,9 @@
     python3 ros/package_tree.py BUILD PACKAGES
 
 PACKAGES gets chainshaper, compiled for this Python, with what distributions lack inside it
-(`chainshaper/vendored`, pinned in `vendored.txt`). BUILD has what the next run builds on. CMakeLists.txt
-and scripts/build_deb call it. It needs pip, CMake, a C++ compiler and Python's headers.
+(`chainshaper/vendored`, pinned in `vendored.txt`). BUILD has what the next run builds on.
+CMakeLists.txt and scripts/build_deb call it. It needs pip, CMake, a C++ compiler and Python's
+headers.
 
 The pinned files come from PyPI; where there is no network, from the folder `ros/wheels`:
 
@@ -76,7 +77,7 @@ def _installed(pins: Path, folder: Path) -> Path:
 
 
 def _pip(verb: str, *words: str, pins: Path) -> None:
-    """Run pip for pinned packages, from files where they are here. Ends the build where it fails."""
+    """Run pip for pinned packages, from files where they are here; end the build where it fails."""
     where = ["--no-index", "--find-links", str(WHEELS)] if WHEELS.is_dir() else []
     if verb == "download":
         where = []

@@ -49,11 +49,9 @@ def _environment(robot: Path, **more: str) -> dict[str, str]:
 
 
 def _on_github(robot: Path, inputs: Mapping[str, str]) -> tuple[int, str]:
-    """Run the steps as a runner of GitHub does; return the exit code of the check, and a summary."""
+    """Run the steps as a runner of GitHub does; return the check's exit code, and the summary."""
     action = yaml.safe_load((ROOT / "action.yml").read_text())
-    files = {
-        name: robot / name for name in ("GITHUB_PATH", "GITHUB_OUTPUT", "GITHUB_STEP_SUMMARY")
-    }
+    files = {name: robot / name for name in ("GITHUB_PATH", "GITHUB_OUTPUT", "GITHUB_STEP_SUMMARY")}
     for file in files.values():
         file.write_text("")
     values = {f"inputs.{name}": str(of.get("default", "")) for name, of in action["inputs"].items()}
@@ -87,16 +85,22 @@ def test_on_github_a_broken_limit_fails_and_is_commented_once(robot: Path) -> No
     assert code == 0
     body = (robot / "bin/gh.body").read_text()
     assert body == f"<!-- chainshaper check -->\n### chainshaper check\n\n{summary}"
-    assert (robot / "bin/gh.calls").read_text().splitlines()[-1].startswith(
-        "api --silent --method POST repos/team/robot/issues/7/comments"
+    assert (
+        (robot / "bin/gh.calls")
+        .read_text()
+        .splitlines()[-1]
+        .startswith("api --silent --method POST repos/team/robot/issues/7/comments")
     )
     (robot / "bin/gh.earlier").write_text("1234\n")
     code, summary = _on_github(robot, {"recordings": "\nru*\n", "budget": "broken.yaml"})
     assert code == 1
     assert "1 us" in summary or "1 µs" in summary or "0.001" in summary, summary
     assert (robot / "bin/gh.body").read_text().endswith(summary)
-    assert (robot / "bin/gh.calls").read_text().splitlines()[-1].startswith(
-        "api --silent --method PATCH repos/team/robot/issues/comments/1234"
+    assert (
+        (robot / "bin/gh.calls")
+        .read_text()
+        .splitlines()[-1]
+        .startswith("api --silent --method PATCH repos/team/robot/issues/comments/1234")
     )
     suite = ElementTree.parse(robot / "chainshaper-check.xml").getroot()  # noqa: S314 - our own
     assert list(suite.iter("failure"))

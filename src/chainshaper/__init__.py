@@ -66,8 +66,8 @@ if TYPE_CHECKING:
     from chainshaper.planning import save_plan as save_plan
     from chainshaper.reporting.figures import draw_distribution as draw_distribution
     from chainshaper.reporting.figures import draw_latency as draw_latency
-    from chainshaper.reporting.graph_drawing import write_picture as write_picture
     from chainshaper.reporting.foxglove import export_mcap as export_mcap
+    from chainshaper.reporting.graph_drawing import write_picture as write_picture
     from chainshaper.reporting.page import write_report as write_report
     from chainshaper.reporting.perfetto import export_perfetto as export_perfetto
     from chainshaper.robot.serialized import origin_of as origin_of

@@ -2,10 +2,11 @@
 
 In Python `Shape(plan="plan.yaml")`, in XML `<shape plan="plan.yaml"/>`, in YAML
 `- shape: {plan: plan.yaml}`. `ros2 launch … --shape plan.yaml` puts it before all else. It includes
-what `chainshaper splice plan.yaml` writes, without launch files, into the folder of the launch's logs.
+what `chainshaper splice plan.yaml` writes, without launch files, into the folder of the launch's
+logs.
 
-`ros2 launch` loads this file where launch files have tags in XML and YAML. It calls chainshaper as a
-program, so that the robot's process imports nothing of what that depends on. Upstream: launch,
+`ros2 launch` loads this file where launch files have tags in XML and YAML. It calls chainshaper as
+a program, so that the robot's process imports nothing of what that depends on. Upstream: launch,
 `launch/frontend/expose.py`.
 """
 
@@ -101,7 +102,10 @@ def _unused(folder: Path) -> Path:
 
 
 def _spliced(words: Sequence[str]) -> dict[str, Any]:
-    """Return what `chainshaper splice` has written. RuntimeError, which ends the launch: nothing."""
+    """Return what `chainshaper splice` has written.
+
+    Raises RuntimeError, which ends the launch: it has written nothing.
+    """
     command = [*PROGRAM, "splice", *words, "--json"]
     finished = subprocess.run(command, capture_output=True, text=True, check=False)
     if finished.returncode:

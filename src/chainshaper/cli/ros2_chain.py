@@ -13,7 +13,6 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from chainshaper.values.errors import PlatformError
 from chainshaper.vendored_packages import CALLED, has_vendored
 
 __all__ = ["ChainCommand"]
@@ -71,19 +70,12 @@ def _run(arguments: list[str]) -> int:
     if has_vendored():  # these packages are not for the process of `ros2`
         sys.stdout.flush()
         os.environ[CALLED] = "ros2 chain"
-        os.execv(sys.executable, [sys.executable, "-m", "chainshaper", *arguments])
+        command = [sys.executable, "-m", "chainshaper", *arguments]
+        os.execv(sys.executable, command)  # noqa: S606 - no shell is wanted
     from chainshaper.cli import main
-    from chainshaper.cli.output import say
 
     try:
         main(arguments, "ros2 chain")
-    except ModuleNotFoundError as error:  # built with colcon, which installs no dependencies
-        say(  # the last line of a failed command
-            f"error: ros2 chain needs the Python package {error.name}: install it into a virtual "
-            "environment that sees the system's packages, and start `python $(which ros2) chain` "
-            "there (docs/install.md)"
-        )
-        return PlatformError.exit_code
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else int(ended.code is not None)
     return 0

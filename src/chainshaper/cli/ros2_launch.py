@@ -1,4 +1,4 @@
-"""`ros2 launch … --shape plan.yaml`: the launch is shaped by a plan, and its files stay as they are.
+"""`ros2 launch … --shape plan.yaml`: a plan shapes the launch, whose files stay as they are.
 
 `ros2 launch` takes options from the entry points ``ros2launch.option`` of all installed packages.
 Upstream: launch_ros, `ros2launch/option/__init__.py`.

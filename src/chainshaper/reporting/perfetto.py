@@ -25,7 +25,6 @@ import polars as pl
 from chainshaper.analysis import DataFlow, LatencyAnalysis, graph_of, recorded_flow
 from chainshaper.reporting.timeline import Timeline, timeline_of
 from chainshaper.values import events
-from chainshaper.values.application import trigger_text
 from chainshaper.values.errors import shown
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.recording import Recording

@@ -35,14 +35,12 @@ def package_values() -> Mapping[str, str]:
 
 
 def with_licence(files: Mapping[str, str]) -> dict[str, str]:
-    """Return a package's files, by their paths, with a notice in each source file and the licence."""
+    """Return a package's files, by their paths, with a notice in each, and with the licence."""
     notice = _NOTICE.format(owner=package_values()["MAINTAINER"]).splitlines()
     licensed = {}
     for path, text in files.items():
         sign = _COMMENTS.get(PurePath(path).suffix)
-        if sign is not None:
-            lines = [f"{sign} {line}".rstrip() for line in notice]
-            text = "\n".join([*lines, "", text])
-        licensed[path] = text
+        lines = [] if sign is None else [f"{sign} {line}".rstrip() for line in notice] + [""]
+        licensed[path] = "\n".join([*lines, text])
     licence = distribution("chainshaper").read_text("licenses/LICENSE")
     return licensed | {"LICENSE": licence or "Apache-2.0\n"}
