@@ -19,6 +19,7 @@ from typing import Any
 
 from chainshaper.vendored_packages import has_vendored
 
+
 class ChainshaperError(Exception):
     """A failure that chainshaper expects to happen; its message says all that a person needs."""
 
