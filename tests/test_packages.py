@@ -25,7 +25,7 @@ else:
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-MANIFEST = ElementTree.parse(ROOT / "package.xml")  # noqa: S314 - our own
+MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()  # noqa: S314 - our own
 PYTHONS = ("3.10", "3.11", "3.12", "3.13", "3.14")
 
 
@@ -120,9 +120,9 @@ def test_the_ros_package_is_built_by_cmake_and_brings_what_it_needs(tmp_path: Pa
     # Of this checkout, in which CMake compiles only what has changed since.
     build, prefix = ROOT / "build/colcon", tmp_path / "install"
     for command in (
-        ["cmake", "-S", ROOT, "-B", build, f"-DPython3_EXECUTABLE={python}"],
-        ["cmake", "--build", build],
-        ["cmake", "--install", build, "--prefix", prefix],
+        ["cmake", "-S", str(ROOT), "-B", str(build), f"-DPython3_EXECUTABLE={python}"],
+        ["cmake", "--build", str(build)],
+        ["cmake", "--install", str(build), "--prefix", str(prefix)],
     ):
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout + done.stderr

@@ -9,8 +9,9 @@ import signal
 import sys
 import threading
 
-from chainshaper import launch_actions
 from ros2cli.cli import main
+
+from chainshaper import launch_actions
 
 python, seconds, *words = sys.argv[1:]
 launch_actions.PROGRAM = (python, *launch_actions.PROGRAM[1:])

@@ -36,10 +36,10 @@ XML = """<launch>{shape}<executable cmd="{command}"/></launch>
 YAML = """launch:
 {shape}- executable: {{cmd: "{command}"}}
 """
-SHAPES = {
-    "robot.launch.py": "Shape(plan={plan!r}), ",
-    "robot.launch.xml": '<shape plan="{plan}"/>',
-    "robot.launch.yaml": "- shape: {{plan: {plan}}}\n",
+ROBOTS = {  # by file: its text, and that of the action in it
+    "robot.launch.py": (PYTHON, "Shape(plan={plan!r}), "),
+    "robot.launch.xml": (XML, '<shape plan="{plan}"/>'),
+    "robot.launch.yaml": (YAML, "- shape: {{plan: {plan}}}\n"),
 }
 
 
@@ -93,13 +93,13 @@ def robot_file(folder: Path, name: str, plan: Path | None) -> str:
     """A launch file in the language of its name, with the action if it gets a plan."""
     words = [*PROGRAM, str(folder / "published"), "--ros-args"]
     words += ["-r", "__node:=ndt", "-r", "output:=/pose"]
-    shape = "" if plan is None else SHAPES[name].format(plan=str(plan))
-    text = {"y": PYTHON, "l": XML if name.endswith("xml") else YAML}[name[-1]]
+    text, action = ROBOTS[name]
+    shape = "" if plan is None else action.format(plan=str(plan))
     (folder / name).write_text(text.format(shape=shape, words=words, command=" ".join(words)))
     return str(folder / name)
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", ROBOTS)
 def test_the_action_shapes_what_is_launched_behind_it(
     launched: Any, tmp_path: Path, plan: Path, name: str
 ) -> None:
