@@ -3,6 +3,7 @@
 ament's linters look for a notice in each source file, and for the file LICENSE in each package.
 """
 
+import re
 from collections.abc import Mapping
 from email.utils import parseaddr
 from functools import cache
@@ -24,6 +25,7 @@ distributed under the License is distributed on an "AS IS" BASIS,
 WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 See the License for the specific language governing permissions and
 limitations under the License."""
+_STATEMENT = re.compile(r"\A(//|#) Copyright 2026 .*\n")  # at the top of our sources
 _COMMENTS = {".cpp": "//", ".hpp": "//", ".py": "#"}
 
 
@@ -41,6 +43,6 @@ def with_licence(files: Mapping[str, str]) -> dict[str, str]:
     for path, text in files.items():
         sign = _COMMENTS.get(PurePath(path).suffix)
         lines = [] if sign is None else [f"{sign} {line}".rstrip() for line in notice] + [""]
-        licensed[path] = "\n".join([*lines, text])
+        licensed[path] = "\n".join([*lines, _STATEMENT.sub("", text) if lines else text])
     licence = distribution("chainshaper").read_text("licenses/LICENSE")
     return licensed | {"LICENSE": licence or "Apache-2.0\n"}
