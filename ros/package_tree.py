@@ -54,7 +54,11 @@ def make_tree(build: Path, packages: Path) -> None:
     vendored = _installed(VENDORED, build / "vendored")
     made = build / "wheel"
     shutil.rmtree(made, ignore_errors=True)
-    environment = {**os.environ, "PYTHONPATH": str(tools)}
+    environment = {
+        "CMAKE_BUILD_PARALLEL_LEVEL": str(os.cpu_count() or 1),  # unless the user says another
+        **os.environ,
+        "PYTHONPATH": str(tools),
+    }
     command = [sys.executable, "-c", _BUILD, str(made), str(build / "native")]
     subprocess.run(command, check=True, cwd=SOURCE, env=environment)
     shutil.rmtree(packages, ignore_errors=True)
