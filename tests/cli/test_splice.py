@@ -115,6 +115,17 @@ def test_a_throttler_needs_no_plan_and_undo_the_folder_only(files: Files) -> Non
     assert "nothing to undo" in refused(2, "splice", "--undo", "-o", folder)
 
 
+def test_without_launch_files_it_says_where_to_include_what_it_writes(files: Files) -> None:
+    plan, _, folder = files
+    alone = folder / "shaping.launch.py"
+    shown = called("splice", plan, "-o", folder).out.splitlines()[-1]
+    assert shown == f"include {alone} in your launch file, before all else"
+    assert "LAUNCH_FILES = []" in alone.read_text()
+    said = json_of("splice", plan, "-o", folder)
+    assert (said["launch"], said["originals"]) == ({str(alone): str(alone)}, {})
+    assert "splice yours" in refused(2, "splice", plan, alone, "-o", folder.with_name("again"))
+
+
 @pytest.mark.parametrize("word", ["typed", "component"])
 def test_kinds_that_are_found_out_now_are_no_choice(files: Files, word: str) -> None:
     plan, robot, folder = files

@@ -220,6 +220,8 @@ def original_words(words: Sequence[str], *, throttled: bool = False) -> list[str
             originals.append(str(file))
             continue
         copied = original_words(manifest["copies"][file.name], throttled=throttled)
+        if not copied:
+            raise InputError(f"{file} includes no launch file: splice yours, which includes it")
         if is_run(copied) and len(words) > 1:
             raise InputError(
                 f"{file} stands for `{' '.join(copied)}`, which is spliced alone: splice it into"
