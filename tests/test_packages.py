@@ -128,7 +128,7 @@ def test_the_ros_package_is_built_by_cmake_and_brings_what_it_needs(tmp_path: Pa
         assert done.returncode == 0, done.stdout + done.stderr
     (packages,) = prefix.glob("lib/python3.*/site-packages")
     ours = {path.relative_to(ROOT / "src") for path in (ROOT / "src/chainshaper").rglob("*")}
-    wanted = {path for path in ours if (ROOT / "src" / path).is_file() and path.suffix != ".pyc"}
+    wanted = {p for p in ours if (ROOT / "src" / p).is_file() and "__pycache__" not in p.parts}
     assert {path for path in wanted if not (packages / path).is_file()} == set()
     assert (prefix / "share/ament_index/resource_index/packages/chainshaper").is_file()
     environment = {"PATH": os.defpath, "PYTHONPATH": str(packages)}
