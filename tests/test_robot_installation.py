@@ -125,7 +125,8 @@ def test_figures_name_the_extra_that_draws_them(core: Path, tmp_path: Path) -> N
     refused = _run(core, "compare", *recordings, "--figures", str(tmp_path / "figures"))
     assert refused.returncode == 3
     assert refused.stderr.strip().splitlines()[-1] == (
-        "error: this needs matplotlib, which is not installed: pip install 'chainshaper[analysis]'"
+        "error: this needs matplotlib, which is not installed: install it with"
+        " `pip install 'chainshaper[analysis]'`"
     )
 
 

@@ -67,10 +67,10 @@ if TYPE_CHECKING:
     from chainshaper.reporting.figures import draw_distribution as draw_distribution
     from chainshaper.reporting.figures import draw_hops as draw_hops
     from chainshaper.reporting.figures import draw_latency as draw_latency
+    from chainshaper.reporting.foxglove import export_mcap as export_mcap
     from chainshaper.reporting.graph_drawing import write_picture as write_picture
     from chainshaper.reporting.notebook import html_of as html_of
     from chainshaper.reporting.page import write_report as write_report
-    from chainshaper.reporting.perfetto import export_mcap as export_mcap
     from chainshaper.reporting.perfetto import export_perfetto as export_perfetto
     from chainshaper.robot.serialized import origin_of as origin_of
     from chainshaper.simulation import simulate as simulate
@@ -116,9 +116,12 @@ def __getattr__(name: str) -> Any:
         return sorted(_homes())
     from importlib import import_module
 
+    from chainshaper.vendored_packages import use_vendored
+
     home = _homes().get(name)
     if home is None:
         raise AttributeError(f"module 'chainshaper' has no attribute {name!r}")
+    use_vendored()
     return getattr(import_module(home), name)
 
 

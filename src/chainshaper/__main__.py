@@ -13,7 +13,11 @@ with contextlib.suppress(OSError):  # that folder may be gone
     if sys.path[:1] == [os.getcwd()]:  # noqa: PTH109 - as `-m` has put it there
         del sys.path[0]
 
-from chainshaper.cli import main
+from chainshaper.vendored_packages import CALLED, use_vendored
+
+use_vendored()
+
+from chainshaper.cli import main  # noqa: E402 - it may need what is vendored
 
 if __name__ == "__main__":
-    main()
+    main(name=os.environ.pop(CALLED, "chainshaper"))

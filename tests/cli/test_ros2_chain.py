@@ -1,21 +1,18 @@
 """`ros2 chain` is `chainshaper`: the same verbs, options, output and exit codes."""
 
 import argparse
-import re
-import subprocess
+import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
-from xml.etree import ElementTree
+from types import ModuleType
 
 import pytest
 from command_line import called
 
-from chainshaper import _core
+from chainshaper import vendored_packages
 from chainshaper.cli.ros2_chain import ChainCommand
-
-ROOT = Path(__file__).parents[2]
 
 
 def _ros2(*arguments: str) -> int:
@@ -68,50 +65,77 @@ def test_it_is_found_by_ros2_and_the_same(
     assert _ros2("chain", "no-such-verb") == 2
 
 
-def test_what_colcon_did_not_install_is_named(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("words", "prefix", "wanted"),
+    [
+        ([], "pl", ["plan"]),
+        (["plan"], "--pol", ["--policy"]),
+        (["plan", "--policy"], "server-per-ch", ["server-per-chain"]),
+    ],
+)
+def test_argcomplete_gets_what_may_stand_at_the_cursor(
+    words: list[str], prefix: str, wanted: list[str]
 ) -> None:
-    monkeypatch.delitem(sys.modules, "chainshaper.cli.app", raising=False)
-    monkeypatch.setitem(sys.modules, "typer", None)
-    assert _ros2("chain", "info") == 3
-    assert "needs the Python package typer: install" in capsys.readouterr().err
+    """Called as argcomplete calls a completer (3.7, `finders.py`)."""
+    parser = argparse.ArgumentParser("ros2 chain")
+    ChainCommand().add_arguments(parser, "ros2 chain")
+    (action,) = [action for action in parser._actions if action.dest == "arguments"]
+    given = argparse.Namespace(arguments=words)
+    completer = action.completer  # type: ignore[attr-defined]
+    assert completer(prefix=prefix, parsed_args=given, action=action, parser=parser) == wanted
 
 
-def test_colcon_s_manifest_has_our_version_and_depends_on_what_we_use() -> None:
-    manifest = ElementTree.parse(ROOT / "ros" / "package.xml")  # noqa: S314 - our own
-    project = (ROOT / "pyproject.toml").read_text()
-    assert f'version = "{manifest.findtext("version")}"' in project
-    packages = [one.text or "" for one in manifest.findall("exec_depend")]
-    names = [name.removeprefix("python3-") for name in packages if name.startswith("python3-")]
-    assert names
-    assert [name for name in names if not re.search(rf'"(py)?{name}>=', project)] == []
+def test_where_packages_are_brought_ros2_becomes_chainshaper(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The packages of an installation for ROS 2 are not imported into the process of `ros2`."""
+    replaced: list[list[str]] = []
+    monkeypatch.setattr(vendored_packages, "FOLDER", str(tmp_path))
+    monkeypatch.setattr(os, "execv", lambda _, command: replaced.append(command))
+    monkeypatch.setenv(vendored_packages.CALLED, "")
+    _ros2("chain", "info")
+    assert replaced[0] == [sys.executable, "-m", "chainshaper", "info"]
+    assert os.environ[vendored_packages.CALLED] == "ros2 chain"
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    vendored_packages.use_vendored()
+    vendored_packages.use_vendored()
+    assert sys.path.count(str(tmp_path)) == 1 and sys.path[0] == str(tmp_path)
 
 
-@pytest.mark.building
-@pytest.mark.timeout(600)
-def test_colcon_would_install_everything(tmp_path: Path) -> None:
-    """What colcon runs for an `ament_python` package, as far as setuptools goes."""
-    pytest.importorskip("setuptools", reason="setuptools is not in this environment")
-    prefix = tmp_path / "install"
-    build = subprocess.run(
-        [
-            *(sys.executable, "setup.py", "-q", "egg_info", "--egg-base", str(tmp_path)),
-            # Of this checkout, in which CMake compiles only what has changed since.
-            *("build", "--build-base", str(ROOT / "build/colcon")),
-            *("install_lib", "--install-dir", str(prefix / "lib"), "--no-compile"),
-            *("install_data", "--install-dir", str(prefix)),
-        ],
-        cwd=ROOT / "ros",
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert build.returncode == 0, build.stderr
-    installed = {p.relative_to(prefix / "lib") for p in (prefix / "lib").rglob("*") if p.is_file()}
-    ours = {p.relative_to(ROOT / "src") for p in (ROOT / "src" / "chainshaper").rglob("*")}
-    wanted = {p for p in ours if (ROOT / "src" / p).is_file() and "__pycache__" not in p.parts}
-    assert wanted - installed == set()
-    native = {Path(_core.__file__).name, "libchainshaper_gate.so", "libchainshaper_trace.so"}
-    assert native <= {p.name for p in installed if p.parent.name == "chainshaper"}
-    assert (prefix / "share/ament_index/resource_index/packages/chainshaper").is_file()
-    assert (prefix / "share/chainshaper/package.xml").is_file()
+class _Launch:
+    """Stands for launch's `LaunchDescription`."""
+
+    def __init__(self, entities: Sequence[object]) -> None:
+        self.entities = entities
+
+
+def test_ros2_launch_gets_the_plan_s_action_before_all_else(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As `ros2 launch` calls its options (ros2launch 0.26, `api/api.py`)."""
+    (found,) = entry_points(group="ros2launch.option")
+    option = found.load()()
+    parser = argparse.ArgumentParser("ros2 launch")
+    option.add_arguments(parser, "ros2 launch")
+    actions = ModuleType("chainshaper.launch_actions")
+    monkeypatch.setattr(actions, "Shape", lambda **values: values, raising=False)
+    launch = ModuleType("launch")
+    monkeypatch.setattr(launch, "LaunchDescription", _Launch, raising=False)
+    monkeypatch.setitem(sys.modules, "chainshaper.launch_actions", actions)
+    monkeypatch.setitem(sys.modules, "launch", launch)
+    robot = _Launch(["robot"])
+
+    def launched(*words: str) -> Sequence[object]:
+        args = parser.parse_args(words)
+        option.prestart(args)
+        (result,) = option.prelaunch(robot, args)
+        option.postlaunch(0, args)
+        entities: Sequence[object] = result.entities
+        return entities
+
+    assert launched() == ["robot"]
+    assert launched("--shape", "p.yaml") == [{"plan": "p.yaml", "apply": None}, "robot"]
+    with_plan = launched("--shape", "p.yaml", "--shape-apply", "fifo")
+    assert with_plan == [{"plan": "p.yaml", "apply": "fifo"}, "robot"]
+    with pytest.raises(RuntimeError, match="add --shape PLAN"):  # ros2 shows its text
+        launched("--shape-apply", "auto")

@@ -116,6 +116,17 @@ def test_a_throttler_needs_no_plan_and_undo_the_folder_only(files: Files) -> Non
     assert "nothing to undo" in refused(2, "splice", "--undo", "-o", folder)
 
 
+def test_without_launch_files_it_says_where_to_include_what_it_writes(files: Files) -> None:
+    plan, _, folder = files
+    alone = folder / "shaping.launch.py"
+    shown = called("splice", plan, "-o", folder).out.splitlines()[-1]
+    assert shown == f"include {alone} in your launch file, before all else"
+    assert "LAUNCH_FILES = []" in alone.read_text()
+    said = json_of("splice", plan, "-o", folder)
+    assert (said["launch"], said["originals"]) == ({str(alone): str(alone)}, {})
+    assert "splice yours" in refused(2, "splice", plan, alone, "-o", folder.with_name("again"))
+
+
 @pytest.mark.parametrize("word", ["typed", "component"])
 def test_kinds_that_are_found_out_now_are_no_choice(files: Files, word: str) -> None:
     plan, robot, folder = files
@@ -169,8 +180,8 @@ def test_types_are_those_of_the_recording_that_saw_them(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("PLAN -o DIR", "give a plan and the launch files"),
-        ("-o DIR", "give a plan and the launch files"),
+        ("PLAN -o DIR --dry-run", "a dry run needs the launch files"),
+        ("-o DIR", "give a plan, and the launch files"),
         ("PLAN ROBOT -o DIR --build --node python", "--node python needs no building"),
         ("PLAN ROBOT -o DIR --node cpp --type Header", "'Header' is not a message type"),
         ("ROBOT -o DIR --throttle /t1=100ms", "is not known: name a recording of the application"),

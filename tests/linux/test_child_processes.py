@@ -61,7 +61,8 @@ def marks(evil: Path) -> str:
 def test_one_place_starts_python() -> None:
     """And the processes of ROS 2 nodes, which run without our package: those have a line each.
 
-    What starts a node again starts it as `ros2 launch` does: rclpy is where PYTHONPATH leads.
+    What starts a node again starts it as `ros2 launch` does: rclpy is where PYTHONPATH leads. What
+    `ros2` loads of us runs `chainshaper` as a user would: it has found us in the same places.
     """
     starting = {
         path.relative_to(SOURCES).as_posix(): path.read_text()
@@ -69,7 +70,8 @@ def test_one_place_starts_python() -> None:
         if re.search(r"sys\.executable|multiprocessing|ProcessPool", path.read_text())
     }
     in_nodes, again = "robot/clear_core.py", "robot/python/respawning.py"
-    assert starting.keys() == {"linux/child_processes.py", in_nodes, again}
+    by_ros2 = {"cli/ros2_chain.py", "launch_actions.py"}
+    assert starting.keys() == {"linux/child_processes.py", in_nodes, again, *by_ros2}
     assert '[sys.executable, "-I", "-S", "-c"' in starting[in_nodes]
 
 
@@ -119,7 +121,8 @@ def copied(folder: Path) -> Path:
     root = folder / "install"
     values = ("__init__", "errors", "files", "leftovers", "middleware")
     linux = ("__init__", "child_processes", "scheduling", "threads")
-    for name in ("__init__", *(f"values/{v}" for v in values), *(f"linux/{one}" for one in linux)):
+    package = ("__init__", "vendored_packages")
+    for name in (*package, *(f"values/{v}" for v in values), *(f"linux/{one}" for one in linux)):
         place = root / "chainshaper" / f"{name}.py"
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes((SOURCES / f"{name}.py").read_bytes())

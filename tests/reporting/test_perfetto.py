@@ -237,8 +237,35 @@ def test_mcap_has_every_callback_and_every_cycle(tmp_path: Path) -> None:
         response / 1e6 for response in sorted(instances["end"] - instances["start"])
     ]
     assert "add --perfetto or --mcap" in refused(2, "export", recording.path, "-o", file)
+    perfetto = ("export", "--perfetto", recording.path, "-o", tmp_path / "t.pftrace")
+    assert "add --mcap" in refused(2, *perfetto, "--layout", tmp_path / "l.json")
     wrong = refused(2, "export", "--mcap", recording.path, "-o", tmp_path / "trace.json")
     assert "ends in .mcap" in wrong
+
+
+def test_the_layout_for_foxglove_plots_what_the_file_has(tmp_path: Path) -> None:
+    """Each panel stands in the layout once; each path is a topic and a field of its messages."""
+    reader = pytest.importorskip("mcap.reader")
+    known, file, layout = known_run(tmp_path / "known"), tmp_path / "a.mcap", tmp_path / "a.json"
+    words = ("export", "--mcap", known.path, "-o", file, "--layout", layout)
+    assert called(*words).code == 0
+    fields = set[str]()
+    with file.open("rb") as stream:
+        for _, channel, message in reader.make_reader(stream).iter_messages():
+            fields |= {f"{channel.topic}.{name}" for name in json.loads(message.data)}
+    written = json.loads(layout.read_text())
+    panels = written["configById"]
+    paths = [path["value"] for panel in panels.values() for path in panel["paths"]]
+    assert {*paths} <= fields
+    numbers = {field for field in fields if field.endswith(("_ms", ".late"))}
+    assert sorted(paths) == sorted(numbers), "all that can be plotted, once"
+
+    def shown(node: str | dict[str, Any]) -> list[str]:
+        return [node] if isinstance(node, str) else shown(node["first"]) + shown(node["second"])
+
+    assert shown(written["layout"]) == [*panels]
+    assert "is not overwritten" in refused(2, *words[:4], tmp_path / "b.mcap", *words[5:])
+    assert not (tmp_path / "b.mcap").exists()
 
 
 def test_a_recording_that_names_no_chain_is_exported_with_its_only_one(tmp_path: Path) -> None:

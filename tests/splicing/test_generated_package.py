@@ -10,6 +10,7 @@ import pytest
 from chainshaper.splicing.message_types import message_type_named
 from chainshaper.splicing.node_packages import build_package, cpp_package
 from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.licence import package_values
 
 TYPE = "sensor_msgs/msg/PointCloud2"
 NAMES = ["chainshaper_shaping", "shaping_sensor_msgs_point_cloud2", "shaping_std_msgs_header"]
@@ -37,7 +38,7 @@ def test_the_cpp_package_is_the_generic_one_but_for_what_names_its_type() -> Non
     generic, files = cpp_package(), package(NAMES[1])
     for path, text in {**generic, **files}.items():
         assert not path.endswith(".in")
-        assert "@" not in text.replace("chainshaper@example.org", ""), path
+        assert "@" not in text.replace(package_values()["EMAIL"], ""), path
     lines = files.pop("include/message.hpp").splitlines()
     assert [line for line in lines if "sensor_msgs" in line] == [
         '#include "sensor_msgs/msg/point_cloud2.hpp"',
@@ -56,7 +57,7 @@ def test_the_cpp_package_is_the_generic_one_but_for_what_names_its_type() -> Non
         "words",
     )  # of the native library
     assert files.keys() == {
-        *("src/shaping_node.cpp", "scripts/respawning"),
+        *("src/shaping_node.cpp", "scripts/respawning", "LICENSE"),
         *(f"include/chainshaper_shaping/{header}.hpp" for header in headers),
         *(f"include/gate/{header}.hpp" for header in decisions),
     }

@@ -73,7 +73,7 @@ def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
 def _run(arguments: list[str] | None, name: str) -> None:
     """As :func:`main`, but signals go on raising KeyboardInterrupt where they do so here."""
     from chainshaper.cli.output import say
-    from chainshaper.values.errors import ChainshaperError
+    from chainshaper.values.errors import ChainshaperError, installing
 
     _prepare_output_and_memory()
     _interrupted.clear()
@@ -113,7 +113,7 @@ def _run(arguments: list[str] | None, name: str) -> None:
         package = (error.name or "").partition(".")[0]
         if package not in OF_ANALYSIS:
             raise
-        remedy = "pip install 'chainshaper[analysis]'"
+        remedy = installing("'chainshaper[analysis]'")
         fail(f"this needs {package}, which is not installed: {remedy}", 3)
     except BaseException as error:  # a panic of Polars is no Exception
         # Libraries that are not written in Python raise errors of their own on Ctrl-C.

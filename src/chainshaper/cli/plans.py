@@ -336,7 +336,7 @@ def splice(
     launch: list[str] | None = opt.argument(
         "LAUNCH...",
         "The launch files (.py, .xml, .yaml) and, for --dry-run, launch arguments; or, behind --, "
-        "a `ros2 run …`.",
+        "a `ros2 run …`. None: the new launch file is to be included first in yours.",
     ),
     *,
     output: Path = opt.option("--output -o DIR", "Folder for the launch file.", ...),
@@ -401,8 +401,8 @@ def splice(
     files = words if ran else [word for word in words if ":=" not in word]
     if throttle:
         _refuse_for_throttlers(fallback, message_type, files)
-    elif plan is None or not files:
-        raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
+    elif plan is None:
+        raise InputError("give a plan, and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
     with out.late_progress("splice") as report:
         report(0.0, "looking into the launch files")
         if throttle:
@@ -502,7 +502,10 @@ def _show_splicing(
         out.show_line(f"source {setup}")
     words = [f"{name}:={value}" for name, value in arguments.items()]
     for file in dict.fromkeys(splicing.launch.values()):
-        out.show_line(shlex.join(["ros2", "launch", str(file), *words]))
+        if file in splicing.launch:  # it includes no launch file
+            out.show_line(f"include {file} in your launch file, before all else")
+        else:
+            out.show_line(shlex.join(["ros2", "launch", str(file), *words]))
 
 
 def _splicing_json(splicing: "cs.Splicing", setup: Path | None) -> dict[str, Any]:

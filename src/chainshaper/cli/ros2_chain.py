@@ -2,13 +2,18 @@
 
 `ros2` takes its commands from the entry points ``ros2cli.command`` of all installed packages, and
 parses them with argparse. Everything behind `ros2 chain` is handed on as it is, so both command
-lines are the same, help included. Upstream: ros2cli, `ros2cli/command/__init__.py`.
+lines are the same, help and completion included. Upstream: ros2cli, `ros2cli/command/__init__.py`.
 """
 
 import argparse
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Sequence
 from typing import Any
 
-from chainshaper.values.errors import PlatformError
+from chainshaper.vendored_packages import CALLED, has_vendored
 
 __all__ = ["ChainCommand"]
 
@@ -23,7 +28,10 @@ class ChainCommand:
 
     def add_arguments(self, parser: argparse.ArgumentParser, *_: Any, **__: Any) -> None:
         """Leave all that follows `ros2 chain` to us."""
-        parser.add_argument("arguments", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+        arguments = parser.add_argument(
+            "arguments", nargs=argparse.REMAINDER, help=argparse.SUPPRESS
+        )
+        arguments.completer = _complete  # type: ignore[attr-defined]  # argcomplete reads it
         parser.print_help = lambda *_: _run(["--help"])  # type: ignore[assignment,method-assign]
 
     def main(self, *, args: argparse.Namespace, **_: Any) -> int:
@@ -31,19 +39,43 @@ class ChainCommand:
         return _run(args.arguments or ["--help"])
 
 
+def _complete(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> Sequence[str]:
+    """Return the words that may stand at the cursor: verbs, options and their values, or files.
+
+    Typer knows them, in a process of its own, as it does for the completion of `chainshaper`.
+    """
+    words = ["chainshaper", *parsed_args.arguments]
+    asked = {
+        "_CHAINSHAPER_COMPLETE": "complete_bash",
+        "COMP_WORDS": shlex.join([*words, *([prefix] if prefix else [])]),
+        "COMP_CWORD": str(len(words)),
+    }
+    answer = subprocess.run(
+        [sys.executable, "-m", "chainshaper"],
+        env={**os.environ, **asked},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        check=False,
+    )
+    if answer.stdout.split():
+        return answer.stdout.splitlines()
+    from argcomplete.completers import FilesCompleter
+
+    files: Sequence[str] = FilesCompleter()(prefix)
+    return files
+
+
 def _run(arguments: list[str]) -> int:
+    if has_vendored():  # these packages are not for the process of `ros2`
+        sys.stdout.flush()
+        os.environ[CALLED] = "ros2 chain"
+        command = [sys.executable, "-m", "chainshaper", *arguments]
+        os.execv(sys.executable, command)  # noqa: S606 - no shell is wanted
     from chainshaper.cli import main
-    from chainshaper.cli.output import say
 
     try:
         main(arguments, "ros2 chain")
-    except ModuleNotFoundError as error:  # built with colcon, which installs no dependencies
-        say(  # the last line of a failed command
-            f"error: ros2 chain needs the Python package {error.name}: install it into a virtual "
-            "environment that sees the system's packages, and start `python $(which ros2) chain` "
-            "there (docs/install.md)"
-        )
-        return PlatformError.exit_code
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else int(ended.code is not None)
     return 0

@@ -481,6 +481,9 @@ def export(
     ),
     perfetto: bool = opt.option("--perfetto", "A trace that ui.perfetto.dev opens.", False),
     mcap: bool = opt.option("--mcap", "Times of callbacks and cycles, for Foxglove.", False),
+    layout: Path | None = opt.option(
+        "--layout FILE", "With --mcap: also write the layout of Foxglove's panels (.json)."
+    ),
     chain: str | None = opt.CHAIN,
     plan: Path | None = opt.PLAN_IN_FORCE,
 ) -> None:
@@ -496,6 +499,8 @@ def export(
     from chainshaper.verify.measure import SeveralChainsError
 
     new_file(output, (".mcap",) if mcap else ENDINGS)
+    if layout is not None and not mcap:
+        raise InputError("--layout is for Foxglove: add --mcap")
     in_force = opt.plan_in_force(plan)
     with out.opened("export", trace) as (recording, report):
         report(0.5, "analysing")
@@ -504,7 +509,7 @@ def export(
             measured = cs.measure_latency(recording, chain, in_force)
         report(0.7, "writing")
         if mcap:
-            written = cs.export_mcap(measured or recording, output)
+            written = cs.export_mcap(measured or recording, output, layout)
         else:
             written = cs.export_perfetto(measured or recording, output)
     out.show_line(written.absolute())

@@ -54,7 +54,8 @@ class Splicing:
     """What was spliced."""
 
     folder: Path
-    launch: Mapping[Path, Path]  # by launch file, or executable: the file to launch instead
+    # By launch file, or executable: the file to launch instead; by itself what includes none.
+    launch: Mapping[Path, Path]
     originals: Mapping[Path, Path]  # by that file: the first that it includes
     processes: tuple[ShapingProcess, ...]  # that were added
     logs: tuple[Path, ...]  # of shaping nodes and their standbys
@@ -116,7 +117,8 @@ def splice_launch_files(
 ) -> Splicing:
     """Write a launch file that starts the plan's shaping nodes and launch files, into a new folder.
 
-    ``launch_files`` may be the words of `ros2 run …` as well. With the ``node`` ``auto`` shaping
+    ``launch_files`` may be the words of `ros2 run …` as well, or none: then the new launch file is
+    to be included first in another, whose nodes it shapes. With the ``node`` ``auto`` shaping
     nodes are in C++ only where the caller ``builds`` what is written (:func:`.build_package`); the
     notes say which kinds were chosen (:mod:`.node_kinds`). ``recording`` says who publishes a topic
     and of which type it is, as far as the plan does not. ``fallback`` goes before the plan's.
@@ -455,6 +457,8 @@ def _spliced(
     name = launching.launch_file_name(words)
     copy = folder / name
     place: AbstractContextManager[str | Path]
+    if dry_run_arguments is not None and not words:
+        raise InputError("a dry run needs the launch files, which it carries out: name them")
     if dry_run_arguments is None:
         place = launching.new_folder(folder, {name: words}, throttled=throttled)
     else:
@@ -471,8 +475,8 @@ def _spliced(
     strange = [file for file in files if not executable and str(file) not in words]
     return Splicing(
         folder=folder,
-        launch=dict.fromkeys(files, copy),
-        originals={} if launching.is_run(words) else {copy: Path(words[0])},
+        launch=dict.fromkeys(files or [copy], copy),
+        originals={} if not words or launching.is_run(words) else {copy: Path(words[0])},
         processes=tuple(added.processes),
         logs=(),
         diff="".join(diff),

@@ -51,6 +51,7 @@ _START = (
     "s = u.spec_from_file_location('chainshaper', package) if package else None; "
     "m = s and sys.modules.setdefault('chainshaper', u.module_from_spec(s)); "
     "s and s.loader.exec_module(m); "
+    "from chainshaper.vendored_packages import use_vendored; use_vendored(); "
     "runpy.run_module(module, run_name='__main__', alter_sys=True)"
 )
 

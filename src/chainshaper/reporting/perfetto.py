@@ -1,6 +1,6 @@
-"""A recording as a trace that ui.perfetto.dev opens, or as MCAP, which Foxglove plots.
+"""A recording as a trace that ui.perfetto.dev opens.
 
-Perfetto's trace has the threads of every process with their callbacks; each publication as an
+The trace has the threads of every process with their callbacks; each publication as an
 instant, with an arrow to the callback that took the message; and the sends of asynchronous
 publishers' threads. Further rows have the traversals of the chain with their hops, the messages
 that the gate held back, the slots of the servers, and stalls of the machine. Times are ns of the
@@ -12,8 +12,6 @@ tracks of one name, which the viewer shows as one. Numbers of fields and enumera
 `protos/perfetto/trace/` (perfetto.dev, "Advanced Guide to Programmatic Trace Generation").
 """
 
-import io
-import json
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,8 +25,7 @@ import polars as pl
 from chainshaper.analysis import DataFlow, LatencyAnalysis, graph_of, recorded_flow
 from chainshaper.reporting.timeline import Timeline, timeline_of
 from chainshaper.values import events
-from chainshaper.values.application import trigger_text
-from chainshaper.values.errors import extra_library, shown
+from chainshaper.values.errors import shown
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.recording import Recording
 from chainshaper.verify.measure import PARTS, Measurement
@@ -99,56 +96,6 @@ def export_perfetto(source: Recording | Measurement, path: str | Path) -> Path:
         where = "all cores" if core is None else f"core {core}"
         tracks.append(Track("Stalls of the machine", where, stalls))
     return write_whole(path, encode_trace(tracks, recording.info.clock_offset_ns))
-
-
-def export_mcap(source: Recording | Measurement, path: str | Path) -> Path:
-    """Write times of callbacks, and of a measurement's chain, as messages for Foxglove.
-
-    A topic for each node, ``/chainshaper/<node>``, has a message for each callback instance, at its
-    end; the topic ``/chainshaper/latency`` has one for each cycle of the chain. Times are in ms,
-    log times are CLOCK_REALTIME, as in a bag of the same run. Messages are JSON, with a schema.
-
-    Raises InputError: the path exists already, or does not end in `.mcap`. PlatformError: the
-    package mcap is not installed. OperationError: it cannot be written; nothing is left behind.
-    """
-    path = new_file(path, (".mcap",))
-    writing = extra_library("mcap.writer", "writing MCAP", "mcap")
-    recording = source.recording if isinstance(source, Measurement) else source
-    flow = recorded_flow(recording)
-    callbacks = {callback.id: callback for callback in graph_of(flow).callbacks}
-    rows: list[tuple[int, int, str, dict[str, Value | float]]] = []
-    took = flow.instances.drop_nulls("end").select("callback_id", "start", "end", "execution_ns")
-    for number, start, end, used in took.iter_rows():
-        callback = callbacks[number]
-        starts = trigger_text(callback.topic, callback.period_ns, callback.declared_ns)
-        values: dict[str, Value | float] = {"callback": starts}
-        values |= {"response_ms": (end - start) / 1e6, "execution_ms": used and used / 1e6}
-        rows.append((end, start, callback.node or "/unknown", values))
-    if isinstance(source, Measurement):
-        cycles = source.analysis.traversals.select("start", "end", "latency_ns", "late", "reason")
-        for start, end, latency, late, reason in cycles.iter_rows():
-            values = {"latency_ms": latency and latency / 1e6, "late": late, "incomplete": reason}
-            rows.append((end or start, start, "/latency", values))
-    file, offset = io.BytesIO(), recording.info.clock_offset_ns
-    writer, channels = writing.Writer(file), dict[str, int]()
-    writer.start()
-    kinds = {name: {"type": kind} for name, kind in _JSON_TYPES.items()}
-    schema = json.dumps({"type": "object", "properties": kinds}).encode()
-    number = writer.register_schema("chainshaper", "jsonschema", schema)
-    for end, start, topic, values in sorted(rows, key=lambda row: row[0]):
-        if topic not in channels:
-            channels[topic] = writer.register_channel(f"/chainshaper{topic}", "json", number)
-        data = json.dumps({name: value for name, value in values.items() if value is not None})
-        writer.add_message(channels[topic], end + offset, data.encode(), start + offset)
-    writer.finish()
-    return write_whole(path, [file.getvalue()])
-
-
-_JSON_TYPES = {
-    **dict.fromkeys(("latency_ms", "response_ms", "execution_ms"), "number"),
-    **dict.fromkeys(("callback", "incomplete"), "string"),
-    "late": "boolean",
-}
 
 
 def _thread_tracks(recording: Recording, flow: DataFlow, timeline: Timeline) -> list[Track]:

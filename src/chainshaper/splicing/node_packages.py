@@ -11,6 +11,7 @@ from chainshaper.sources.preload import native_library
 from chainshaper.splicing.message_types import MessageType, ros_prefixes
 from chainshaper.splicing.python_node import NODES, RESPAWNING
 from chainshaper.values.errors import OperationError, PlatformError, text_of
+from chainshaper.values.licence import package_values, with_licence
 
 GENERIC_PACKAGE = "chainshaper_shaping"
 _CORE = native_library("core")  # the headers that the library was built from
@@ -22,6 +23,7 @@ def cpp_package(shaped: MessageType | None = None, *, component: bool = False) -
     messages = sorted({"std_msgs"} if shaped is None else {"std_msgs", shaped.package})
     depends = [*messages, "rclcpp_components"] if component else messages
     values = {
+        **package_values(),
         "PROJECT": GENERIC_PACKAGE,
         "FOR": "topics of any type",
         "NODES": "shaping_node throttler",
@@ -52,7 +54,7 @@ def cpp_package(shaped: MessageType | None = None, *, component: bool = False) -
     for path in sorted((_CORE / "gate").glob("*.hpp")):
         files[f"include/gate/{path.name}"] = path.read_text(encoding="utf-8")
     del files[left_out]
-    return files
+    return with_licence(files)
 
 
 def missing_build_tool() -> tuple[str, str] | None:
@@ -88,7 +90,10 @@ def build_package(folder: Path) -> Path:
     """
     check_build_tools()
     build = subprocess.run(
-        ["colcon", "--log-base", "log", "build", "--base-paths", ".", "--merge-install"],
+        [
+            *("colcon", "--log-base", "log", "build", "--base-paths", ".", "--merge-install"),
+            *("--cmake-args", "-DBUILD_TESTING=OFF"),
+        ],
         cwd=folder,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,

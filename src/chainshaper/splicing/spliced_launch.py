@@ -39,6 +39,7 @@ _SIGNS = {  # what a launch file has in it, by the end of its name; only launch 
     **dict.fromkeys((".yaml", ".yml"), r"(?m)^[\s'\"{]*launch\b"),
     ".launch": "launch",
 }
+ALONE = "shaping.launch.py"  # of a launch file that includes none
 _TEXT = '''"""Starts {launched} with nodes added; written by `chainshaper splice`."""
 
 import importlib.util
@@ -137,6 +138,8 @@ def _file_of_package(package: str, name: str) -> Path:
 
 def launch_file_name(words: Sequence[str]) -> str:
     """Return the name of the launch file that stands for others, or for `ros2 run …`."""
+    if not words:
+        return ALONE
     name = executable_of(words) or Path(words[0]).name
     return re.sub(r"([.]launch)?([.](py|xml|ya?ml|launch))?$", "", name, count=1) + ".launch.py"
 
@@ -150,6 +153,7 @@ def launch_text(
     """Return the text of the launch file that starts processes and includes launch files.
 
     ``words`` are the files, or `ros2 run …`; everything launched gets the ``environment`` as well.
+    Without words it is for what the same `ros2 launch` starts after it.
     """
     files, actions = list(words), list[dict[str, Any]]()
     for process in processes:
@@ -161,6 +165,7 @@ def launch_text(
         files = []
         actions.append({"cmd": [*words], "output": "screen"})
     launched = executable_of(words) or ", ".join(Path(word).name for word in words)
+    launched = launched or "what is launched after it"
     return _TEXT.format(
         launched=re.sub(r"[^\w., -]", "_", launched),  # so a file's name cannot end the docstring
         files=pformat(files, width=96),
@@ -215,6 +220,8 @@ def original_words(words: Sequence[str], *, throttled: bool = False) -> list[str
             originals.append(str(file))
             continue
         copied = original_words(manifest["copies"][file.name], throttled=throttled)
+        if not copied:
+            raise InputError(f"{file} includes no launch file: splice yours, which includes it")
         if is_run(copied) and len(words) > 1:
             raise InputError(
                 f"{file} stands for `{' '.join(copied)}`, which is spliced alone: splice it into"

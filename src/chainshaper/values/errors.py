@@ -17,6 +17,8 @@ import importlib
 import re
 from typing import Any
 
+from chainshaper.vendored_packages import has_vendored
+
 
 class ChainshaperError(Exception):
     """A failure that chainshaper expects to happen; its message says all that a person needs."""
@@ -52,7 +54,17 @@ def extra_library(name: str, purpose: str, extra: str | None = None) -> Any:
         package = name.partition(".")[0]
         wanted = package if extra is None else f"'chainshaper[{extra}]'"
         lacks = f"{purpose} needs the Python package {package} ({error})"
-        raise PlatformError(f"{lacks}: install it with `pip install {wanted}`") from error
+        raise PlatformError(f"{lacks}: {installing(wanted)}") from error
+
+
+def installing(wanted: str) -> str:
+    """Return how packages are added to this installation, as pip names them."""
+    if has_vendored():
+        return (
+            "the package for ROS 2 or Debian does not bring it: install chainshaper with pip, into"
+            f" a virtual environment, and there {wanted}"
+        )
+    return f"install it with `pip install {wanted}`"
 
 
 _UNSAFE = re.compile(

@@ -20,6 +20,7 @@ from chainshaper.values.files import (
     rename_output,
     write_whole,
 )
+from chainshaper.values.licence import package_values, with_licence
 from chainshaper.workload.description import (
     Application,
     CallbackDescription,
@@ -84,6 +85,7 @@ def _files(application: Application, package: str) -> dict[str, str]:
         if application.topic(topic).publication == "asynchronous"
     }
     values = {
+        **package_values(),
         "PACKAGE": package,
         "DESCRIPTION": escape(" ".join(application.name.split())),
         "APPLICATION": ",\n".join(_node(application, name) for name in application.nodes),
@@ -102,7 +104,7 @@ def _files(application: Application, package: str) -> dict[str, str]:
     if topics := sorted({topic for _, topic in publishers}):
         profiles = "".join(map(_PROFILE.format, topics))
         files["launch/asynchronous.xml"] = _PROFILES.format(profiles)
-    return files
+    return with_licence(files)
 
 
 def _refuse(application: Application, place: str, callback: CallbackDescription) -> None:
