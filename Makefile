@@ -12,10 +12,15 @@ export CMAKE_CXX_COMPILER_LAUNCHER = $(ccache)
 export CCACHE_DIR = $(CURDIR)/build/ccache
 endif
 
-.PHONY: demo test test-untimed test-timed test-waiting test-building test-kernel core-tests lint benchmark experiments docs clean
+.PHONY: demo demo-ros ros2-wheels test test-untimed test-timed test-waiting test-building test-kernel core-tests lint benchmark experiments docs clean
 
 demo: .venv/.ready
 	.venv/bin/chainshaper demo
+
+# The same as real ROS 2 nodes, on a machine without ROS 2: scripts/ros2-wheels brings one.
+demo-ros: .venv/.ready
+	scripts/ros2-wheels
+	. .venv-ros/setup.sh && .venv/bin/chainshaper demo --ros
 
 # Tests that need the machine's cores for themselves, and beside them those that mostly wait for
 # tracers and other programs; those that compile, and all others, which leave the cores to these
@@ -24,10 +29,14 @@ demo: .venv/.ready
 test:
 	scripts/test-tools
 	rm -rf build/tried
-	$(MAKE) .venv/.ready-dev
+	$(MAKE) --jobs=2 .venv/.ready-dev ros2-wheels
 	$(MAKE) --jobs=6 --output-sync=line \
 		lint core-tests test-untimed test-timed test-waiting test-building; \
 		code=$$?; scripts/run-tests --tried-twice; exit $$code
+
+# Tests of a real ROS 2 run on it where no other one is; without it they skip (tests/helpers/ros2.py).
+ros2-wheels:
+	-[ "$$TEST_TOOLS" = leave ] || scripts/ros2-wheels
 
 test-untimed: .venv/.ready-dev
 	scripts/run-tests untimed "not timed and not waiting and not building" nice

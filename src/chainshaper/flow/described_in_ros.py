@@ -97,6 +97,7 @@ def run_in_ros(
                 plan=plan,
                 gate_logs=gates.logs,
                 watch_stalls=realtime,
+                ask_qos=False,  # the description says them
                 progress=progress,
             )
         except OperationError as error:

@@ -24,6 +24,7 @@ from typing import Any
 import rclpy
 from builtin_interfaces.msg import Time
 from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
@@ -98,7 +99,10 @@ class DescribedNode(Node):  # type: ignore[misc]
         """Return what a callback does: spend its time, publish with a stamp, and do the rest."""
         publishers, messages = [], []
         for topic in callback["publishes"]:
-            publishers.append(self.create_publisher(CompressedImage, topic, self._quality(topic)))
+            quality = self._quality(topic)
+            if (lifespan_ns := self._topics[topic]["lifespan_ns"]) is not None:
+                quality.lifespan = Duration(nanoseconds=lifespan_ns)
+            publishers.append(self.create_publisher(CompressedImage, topic, quality))
             if self._topics[topic]["is_taken"]:
                 self._outputs.append(publishers[-1])
             messages.append(CompressedImage(data=bytes(self._topics[topic]["payload"])))
@@ -153,11 +157,11 @@ def schedule(executor: dict[str, int], dds: dict[str, int]) -> None:
 
     A gate in this process has seen to its thread by itself.
     """
-    for tid in map(int, os.listdir("/proc/self/task")):
+    for thread in Path("/proc/self/task").iterdir():
         with suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
-            name = Path(f"/proc/self/task/{tid}/comm").read_bytes()
-            if name.startswith(b"gate-"):
+            if (thread / "comm").read_bytes().startswith(b"gate-"):
                 continue
+            tid = int(thread.name)
             wanted = executor if tid == os.getpid() else dds
             os.sched_setscheduler(tid, os.SCHED_FIFO, os.sched_param(wanted["priority"]))
             os.sched_setaffinity(tid, {wanted["core"]})

@@ -97,9 +97,7 @@ def _node_command(file: Path, name: str, renamed: Mapping[str, str]) -> list[str
     return ["python3", str(_PROGRAM), str(file), "--ros-args", *remaps]
 
 
-def _script(
-    commands: Sequence[Sequence[str]], environment: Mapping[str, str], said: Path
-) -> str:
+def _script(commands: Sequence[Sequence[str]], environment: Mapping[str, str], said: Path) -> str:
     exports = []
     for variable, value in environment.items():
         text = shlex.quote(value)
@@ -137,12 +135,15 @@ def _callback(application: Application, name: str, number: int) -> dict[str, Any
     callback = application.nodes[name].callbacks[number]
 
     def drawn(times: ExecutionTime | None, index: int) -> list[int]:
-        """Return the first block of its execution times, which is gone through again and again."""
+        """Return execution times, which are gone through again and again."""
         if times is None:
             return [0]
         if times.constant_ns is not None:
             return [times.constant_ns]
-        return next(blocks(times, application.seed, node_name(name), index)).tolist()
+        if times.sequence_ns is not None:
+            return [*times.sequence_ns]
+        first = next(blocks(times, application.seed, node_name(name), index))
+        return [*map(int, first)]
 
     return {
         "timer_ns": callback.timer_ns,
@@ -159,6 +160,7 @@ def _topic(application: Application, topic: str) -> dict[str, Any]:
     return {
         "depth": described.depth,
         "reliability": described.reliability,
+        "lifespan_ns": described.lifespan_ns,
         "payload": described.payload,
         "is_taken": any(topic in callback.inputs for _, callback in application.callbacks()),
     }
