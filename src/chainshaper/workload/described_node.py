@@ -53,7 +53,8 @@ def main(file: str) -> None:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # it may come twice
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)  # it may come twice
         node.destroy_node()
         rclpy.try_shutdown()
 

@@ -28,7 +28,8 @@ _START = """\
 # Starts the nodes, each in a process of its own, and ends all of them when one ends.
 exec > {said} 2>&1
 {exports}
-end_all() {{ trap '' INT TERM; kill -INT $(jobs -p) 2> /dev/null; wait; }}
+# Not by SIGINT, which a script's jobs ignore until rclpy listens to signals.
+end_all() {{ trap '' INT TERM; kill -TERM $(jobs -p) 2> /dev/null; wait; }}
 trap 'end_all; exit 0' INT TERM
 {nodes}
 wait -n
