@@ -5,7 +5,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -247,12 +246,20 @@ def test_a_full_disk_is_named(node: Path, full_disk: Path) -> None:
 
 @pytest.mark.ros2
 @pytest.mark.usefixtures("in_ros2")
-def test_real_nodes_are_recorded_with_types_and_qos(tmp_path: Path) -> None:
-    package = ["ros2", "pkg", "prefix", "demo_nodes_cpp"]
-    if subprocess.run(package, capture_output=True, check=False).returncode:
-        pytest.skip("the package demo_nodes_cpp is not installed in this ROS 2")
+@pytest.mark.parametrize(
+    "program",
+    [
+        f"python3 {Path(__file__).with_name('chatting.py')}",
+        pytest.param(
+            "ros2 run demo_nodes_cpp", marks=pytest.mark.ros2("demo_nodes_cpp", "ros2run")
+        ),
+    ],
+    ids=["rclpy", "rclcpp"],
+)
+def test_real_nodes_are_recorded_with_types_and_qos(tmp_path: Path, program: str) -> None:
     path = tmp_path / "rec"
-    nodes = "ros2 run demo_nodes_cpp talker & ros2 run demo_nodes_cpp listener"
+    nodes = f"{program} talker --ros-args -r __node:=talker & "
+    nodes += f"{program} listener --ros-args -r __node:=listener"
     json_of_recording("-o", path, "--duration", "8s", "--", "sh", "-c", nodes)
     info = open_recording(path).info
     assert sorted(info.processes.values()) == ["/listener", "/talker"]

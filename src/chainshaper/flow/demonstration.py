@@ -193,7 +193,7 @@ def _demonstrated(turns: _Turns, folder: Path) -> Demonstration:
     turns.as_it_is(turns.cycles)
     plans = _plans(turns)
     if isinstance(plans, ChainshaperError):
-        if not _often_disturbed(turns.before):
+        if not _at_the_mercy_of_others(turns.before):
             join_runs(turns.before, folder / "before")
             raise plans
         longer = True
@@ -239,6 +239,11 @@ def _plans(turns: _Turns) -> list[Plan] | ChainshaperError:
         return [plan_recording(recording, request=way.request) for way in turns.ways]
     except ChainshaperError as error:
         return error
+
+
+def _at_the_mercy_of_others(runs: Sequence[Recording]) -> bool:
+    """Whether what else the machine does may be why nothing can be planned."""
+    return any(run.info.realtime is False for run in runs) or _often_disturbed(runs)
 
 
 def _often_disturbed(runs: Sequence[Recording]) -> bool:

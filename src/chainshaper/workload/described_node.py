@@ -113,7 +113,7 @@ class DescribedNode(Node):  # type: ignore[misc]
             spend(next(times), since_ns)
             for publisher, message in zip(publishers, messages):  # noqa: B905 - Humble's is older
                 message.header.stamp = stamp
-                publisher.publish(message)
+                publish(publisher, message)
             spend(next(rest), time.thread_time_ns())
 
         return work
@@ -139,6 +139,16 @@ class DescribedNode(Node):  # type: ignore[misc]
     def _quality(self, topic: str) -> Any:
         reliability = QoSReliabilityPolicy[self._topics[topic]["reliability"].upper()]
         return QoSProfile(depth=self._topics[topic]["depth"], reliability=reliability)
+
+
+def publish(publisher: Any, message: Any) -> None:
+    """Publish a message. Raises ExternalShutdownException: the node was asked to end meanwhile."""
+    try:
+        publisher.publish(message)
+    except RuntimeError as error:  # rclpy's RCLError is one
+        if rclpy.ok():
+            raise
+        raise ExternalShutdownException from error
 
 
 def repeated(times_ns: list[int]) -> Iterator[int]:

@@ -28,8 +28,8 @@ _START = """\
 # Starts the nodes, each in a process of its own, and ends all of them when one ends.
 exec > {said} 2>&1
 {exports}
-# Not by SIGINT, which a script's jobs ignore until rclpy listens to signals.
-end_all() {{ trap '' INT TERM; kill -TERM $(jobs -p) 2> /dev/null; wait; }}
+# Not by SIGINT, which a script's jobs ignore until rclpy listens to signals; and rclpy misses some.
+end_all() {{ trap '' INT TERM; while kill -TERM $(jobs -pr) 2> /dev/null; do sleep 0.5; done; }}
 trap 'end_all; exit 0' INT TERM
 {nodes}
 wait -n
