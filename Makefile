@@ -23,23 +23,28 @@ demo-ros: .venv/.ready
 	. .venv-ros/setup.sh && .venv/bin/chainshaper demo --ros
 
 # Tests that need the machine's cores for themselves, and beside them those that mostly wait for
-# tracers and other programs; those that compile, and all others, which leave the cores to these
-# (tests/conftest.py); the C++ library's own; and what looks at the code. What had to be tried twice
-# stands at the end.
+# tracers and other programs. What computes and compiles takes only what these leave (`nice -n 19`),
+# and as two lanes, so that no more stand in line than there are cores: all other tests; and after
+# each other what looks at the code, the C++ library's own tests, and the tests that compile
+# (tests/conftest.py). What had to be tried twice stands at the end.
 test:
 	scripts/test-tools
 	rm -rf build/tried
 	$(MAKE) --jobs=2 .venv/.ready-dev ros2-wheels
-	$(MAKE) --jobs=6 --output-sync=line \
-		lint core-tests test-untimed test-timed test-waiting test-building; \
+	$(MAKE) --jobs=4 --output-sync=line \
+		test-timed test-waiting test-untimed look-and-compile; \
 		code=$$?; scripts/run-tests --tried-twice; exit $$code
+
+.PHONY: look-and-compile
+look-and-compile:
+	$(MAKE) --jobs=1 --keep-going lint core-tests test-building
 
 # Tests of a real ROS 2 run on it where no other one is; without it they skip (tests/helpers/ros2.py).
 ros2-wheels:
 	-[ "$$TEST_TOOLS" = leave ] || scripts/ros2-wheels
 
 test-untimed: .venv/.ready-dev
-	scripts/run-tests untimed "not timed and not waiting and not building" nice
+	scripts/run-tests untimed "not timed and not waiting and not building" nice -n 19
 
 test-timed: .venv/.ready-dev
 	scripts/run-tests timed timed
@@ -48,7 +53,7 @@ test-waiting: .venv/.ready-dev
 	scripts/run-tests waiting "waiting and not timed and not building"
 
 test-building: .venv/.ready-dev
-	scripts/run-tests building building nice
+	scripts/run-tests building building nice -n 19
 
 # In QEMU, what needs another kernel than this machine's: the sched_ext back end, LTTng's kernel
 # tracer. Fetches about 130 MB once; a quarter of an hour or so.
@@ -72,18 +77,18 @@ core-tests: .venv/.ready-dev
 	.venv/bin/cmake -S core -B build/core-tests -DCMAKE_BUILD_TYPE=RelWithDebInfo \
 		-DCHAINSHAPER_BINDINGS=OFF -DCHAINSHAPER_TESTS=ON -DCHAINSHAPER_SANITIZE=ON \
 		-DFUZZ_SECONDS=$(FUZZ_SECONDS)
-	MAKEFLAGS= nice .venv/bin/cmake --build build/core-tests --parallel 2
-	nice .venv/bin/ctest --test-dir build/core-tests --output-on-failure
+	MAKEFLAGS= nice -n 19 .venv/bin/cmake --build build/core-tests --parallel 2
+	nice -n 19 .venv/bin/ctest --test-dir build/core-tests --output-on-failure
 
 lint: .venv/.ready-dev
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
-	nice .venv/bin/mypy
-	nice .venv/bin/lint-imports --no-cache
+	nice -n 19 .venv/bin/mypy
+	nice -n 19 .venv/bin/lint-imports --no-cache
 	.venv/bin/clang-format --dry-run --Werror $(core) $(nodes)
-	nice .venv/bin/clang-tidy --quiet -p $(built) \
+	nice -n 19 .venv/bin/clang-tidy --quiet -p $(built) \
 		$(filter-out core/tests/% core/fuzz/%,$(filter %.cpp,$(core))) $(filter %.cpp,$(in_front_of_rmw))
-	nice scripts/lint-nodes .venv/bin/clang-tidy $(built)preloaded/include
+	nice -n 19 scripts/lint-nodes .venv/bin/clang-tidy $(built)preloaded/include
 
 # Needs a quiet machine and about a quarter of an hour; prints tables, asserts nothing.
 benchmark: .venv/.ready-dev

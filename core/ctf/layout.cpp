@@ -549,57 +549,59 @@ void add_event(Layout & layout, Writer writer, const StreamClass & stream, bool 
 }
 
 // Sets the event class of each id: of small ids in a vector, of others in a sorted list.
-void note_ids(StreamLayout & row, std::vector<std::pair<std::int64_t, std::int32_t>> ids) {
-  if (ids.size() == 1) row.default_event = ids[0].first;
+void note_ids(StreamLayout & stream_layout,
+              std::vector<std::pair<std::int64_t, std::int32_t>> ids) {
+  if (ids.size() == 1) stream_layout.default_event = ids[0].first;
   std::sort(ids.begin(), ids.end());
   for (const auto & [id, event] : ids) {
     if (id >= 0 && id < dense_ids) {
-      row.events.resize(static_cast<std::size_t>(id) + 1, none);
-      row.events.back() = event;
+      stream_layout.events.resize(static_cast<std::size_t>(id) + 1, none);
+      stream_layout.events.back() = event;
     } else {
-      row.rare_events.emplace_back(id, event);
+      stream_layout.rare_events.emplace_back(id, event);
     }
   }
 }
 
 // An event's span is known if its layout is constant, and its start is aligned wherever the
 // header's is.
-void note_spans(const Layout & layout, StreamLayout & row) {
-  if (row.quick.align == 0) return;
-  for (const auto number : row.events) {
+void note_spans(const Layout & layout, StreamLayout & stream_layout) {
+  if (stream_layout.quick.align == 0) return;
+  for (const auto number : stream_layout.events) {
     QuickEvent quick{number, 0};
     if (number != none) {
       const EventLayout & event = layout.events[static_cast<std::size_t>(number)];
-      if (event.align != 0 && row.quick.align % event.align == 0) {
-        const auto behind = row.quick.clock_shift + row.quick.clock_bits;
+      if (event.align != 0 && stream_layout.quick.align % event.align == 0) {
+        const auto behind = stream_layout.quick.clock_shift + stream_layout.quick.clock_bits;
         const auto span = ((behind + event.align - 1) & -event.align) + event.size;
         if (span <= std::numeric_limits<std::int32_t>::max())
           quick.span = static_cast<std::int32_t>(span);
       }
     }
-    row.quick_events.push_back(quick);
+    stream_layout.quick_events.push_back(quick);
   }
 }
 
 void add_stream(Layout & layout, const TraceClass & trace, const StreamClass & stream,
                 Writer header, Steps in_header, std::span<const WantedEvent> & wanted) {
-  StreamLayout row{};
-  row.id = stream.id;
-  row.packet_header = in_header;
-  row.packet_context = header.write("stream.packet.context", stream.packet_context);
-  row.event_header = header.write("stream.event.header", stream.event_header);
-  row.quick = quick_header(stream.event_header, trace.big_endian);
-  if (!trace.of_kernel) row.process = process_place(stream);
-  row.frequency_hz = stream.frequency_hz;
-  row.packet_cost = packet_row_cost + header.cost(in_header) + header.cost(row.packet_context);
-  row.known = header.known();
+  StreamLayout stream_layout{};
+  stream_layout.id = stream.id;
+  stream_layout.packet_header = in_header;
+  stream_layout.packet_context = header.write("stream.packet.context", stream.packet_context);
+  stream_layout.event_header = header.write("stream.event.header", stream.event_header);
+  stream_layout.quick = quick_header(stream.event_header, trace.big_endian);
+  if (!trace.of_kernel) stream_layout.process = process_place(stream);
+  stream_layout.frequency_hz = stream.frequency_hz;
+  stream_layout.packet_cost =
+      packet_row_cost + header.cost(in_header) + header.cost(stream_layout.packet_context);
+  stream_layout.known = header.known();
   if (trace.uuid)
-    row.uuid = *trace.uuid;
+    stream_layout.uuid = *trace.uuid;
   else
-    row.known &= ~(std::uint32_t{1} << uuid_low);
-  if (row.frequency_hz <= 0) throw std::invalid_argument("a clock without a frequency");
+    stream_layout.known &= ~(std::uint32_t{1} << uuid_low);
+  if (stream_layout.frequency_hz <= 0) throw std::invalid_argument("a clock without a frequency");
 
-  const auto header_cost = header.cost(row.event_header);
+  const auto header_cost = header.cost(stream_layout.event_header);
   std::vector<std::pair<std::int64_t, std::int32_t>> ids;
   for (const EventClass & event : stream.events) {
     const auto number = layout.events.size();
@@ -609,11 +611,12 @@ void add_stream(Layout & layout, const TraceClass & trace, const StreamClass & s
       wish = &wanted.front();
       wanted = wanted.subspan(1);
     }
-    add_event(layout, header.following(false), stream, row.knows(cpu_id), header_cost, event, wish);
+    add_event(layout, header.following(false), stream, stream_layout.knows(cpu_id), header_cost,
+              event, wish);
   }
-  note_ids(row, std::move(ids));
-  note_spans(layout, row);
-  layout.streams.push_back(std::move(row));
+  note_ids(stream_layout, std::move(ids));
+  note_spans(layout, stream_layout);
+  layout.streams.push_back(std::move(stream_layout));
 }
 
 void add_trace(Layout & layout, const TraceClass & trace, std::span<const WantedEvent> & wanted) {

@@ -99,10 +99,11 @@ def applied(plan: ChainPlan, folder: Path, *options: str) -> Iterator[subprocess
 
 @contextmanager
 def applied_here(
-    plan: ChainPlan, runs: Path, stop: threading.Event | None = None, **how: Any
+    plan: ChainPlan, runs: Path, stop: threading.Event | None = None, **changed: Any
 ) -> Iterator[list[RunState]]:
-    """A plan in force by a thread of this process, with `fifo` unless ``how`` says else; what was
-    seen of its state.
+    """Put a plan in force by a thread of this process; yield what was seen of its state.
+
+    The back end is `fifo`, unless ``changed`` says else.
 
     Raises:
         ChainshaperError: it does not come into force, or fails while it is.
@@ -110,7 +111,7 @@ def applied_here(
     states: list[RunState] = []
     failures: list[ChainshaperError] = []
     stop = stop or threading.Event()
-    options = {"back_end": "fifo", "stop": stop, "watch": states.append, "folder": runs, **how}
+    options = {"back_end": "fifo", "stop": stop, "watch": states.append, "folder": runs, **changed}
 
     def run() -> None:
         try:
@@ -133,10 +134,10 @@ def applied_here(
 
 
 def wait_until_in_force(process: subprocess.Popen[str]) -> None:
-    said: list[str] = []
-    while not said or not said[-1].startswith("in force"):
-        said.append(known(process.stderr).readline())
-        assert said[-1], f"it ended: {''.join(said)}"
+    lines: list[str] = []
+    while not lines or not lines[-1].startswith("in force"):
+        lines.append(known(process.stderr).readline())
+        assert lines[-1], f"it ended: {''.join(lines)}"
 
 
 def scheduling(pid: int) -> list[object]:
@@ -222,6 +223,6 @@ def command_line(pid: int) -> str:
 
 
 def ended(run: subprocess.Popen[str]) -> str:
-    """What a run said when it ended."""
-    _, said = run.communicate(timeout=60)
-    return said
+    """What a run messages when it ended."""
+    _, messages = run.communicate(timeout=60)
+    return messages

@@ -31,4 +31,7 @@ def bare_plan(
 
 def slots_ms(plan: ChainPlan) -> dict[str, list[tuple[float, float]]]:
     """The slots of each server, in ms."""
-    return {one.name: [(start / MS, end / MS) for start, end in one.slots] for one in plan.servers}
+    return {
+        server.name: [(start / MS, end / MS) for start, end in server.slots]
+        for server in plan.servers
+    }

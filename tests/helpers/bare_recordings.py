@@ -13,7 +13,7 @@ def recorded(
     place = folder / "recording"
     place.mkdir()
     keys = ("node", "topic", "kind")
-    seen = [{**dict(zip(keys, one, strict=True)), "type": type_} for one in endpoints]
+    seen = [{**dict(zip(keys, endpoint, strict=True)), "type": type_} for endpoint in endpoints]
     info = {"source": "lttng", "clock_offset_ns": 0, "endpoints": seen, **about}
     (place / "recording.json").write_text(json.dumps(info))
     return open_recording(place)

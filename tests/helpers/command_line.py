@@ -127,8 +127,8 @@ class Running:
 
     def nodes(self) -> dict[str, int]:
         """Its living descendants, by name."""
-        found = marked_processes(self.mark)
-        return {name: pid for pid, name in found.items() if pid != self.process.pid}
+        marked = marked_processes(self.mark)
+        return {name: pid for pid, name in marked.items() if pid != self.process.pid}
 
     def end(self) -> Finished:
         """Wait for its end, and for that of its descendants."""

@@ -18,13 +18,13 @@ _PLACE = Path(tempfile.gettempdir())
 def cores() -> Iterator[None]:
     """Inside, this process has them. Who waits stands in a line: who comes later waits behind."""
     names = (f"chainshaper-tests-{os.getuid()}.{name}" for name in ("line", "cores"))
-    line, own = (os.open(_PLACE / name, os.O_CREAT | os.O_RDWR, 0o600) for name in names)
+    line, lock = (os.open(_PLACE / name, os.O_CREAT | os.O_RDWR, 0o600) for name in names)
     try:
         fcntl.flock(line, fcntl.LOCK_EX)
-        fcntl.flock(own, fcntl.LOCK_EX)
+        fcntl.flock(lock, fcntl.LOCK_EX)
         fcntl.flock(line, fcntl.LOCK_UN)
         yield
     finally:
-        fcntl.flock(own, fcntl.LOCK_UN)  # children that were forked meanwhile have it open, too
-        os.close(own)
+        fcntl.flock(lock, fcntl.LOCK_UN)  # children that were forked meanwhile have it open, too
+        os.close(lock)
         os.close(line)

@@ -69,13 +69,13 @@ def main() -> int:
         environment["PATH"] = str(_programs_but_compilers(folder))
     commands = COMMANDS if os.environ.get("LIVE") == "0" else COMMANDS + LIVE
     for expected, command in commands:
-        code, said, seconds = run(command, folder, environment)
+        code, printed, seconds = run(command, folder, environment)
         sys.stdout.write(f"{code} {seconds:6.2f} s  chainshaper {command}\n")
         sys.stdout.flush()
-        named = code == 0 or "error: " in said
-        if code != expected or not named or "Traceback" in said:
+        named = code == 0 or "error: " in printed
+        if code != expected or not named or "Traceback" in printed:
             failed += 1
-            sys.stdout.write(f"    expected {expected}; it said:\n{said}\n")
+            sys.stdout.write(f"    expected {expected}; it printed:\n{printed}\n")
     return min(failed, 1)
 
 

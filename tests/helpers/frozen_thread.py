@@ -23,12 +23,12 @@ def need_threaded_cgroups() -> Path:
     """The group in which this process is; a machine that has no such thing skips the test."""
     mounts = [line.split() for line in Path("/proc/mounts").read_text().splitlines()]
     roots = [Path(mount[1]) for mount in mounts if mount[2] == "cgroup2"]
-    own = [
+    paths = [
         line[3:] for line in Path("/proc/self/cgroup").read_text().splitlines() if line[:3] == "0::"
     ]
-    if not roots or not own:
+    if not roots or not paths:
         pytest.skip("no cgroup v2 hierarchy is mounted here, so no thread can be frozen")
-    group = roots[0] / own[0].lstrip("/")
+    group = roots[0] / paths[0].lstrip("/")
     if not os.access(group, os.W_OK):
         pytest.skip(f"no permission to make a cgroup in {group}, so no thread can be frozen")
     return group

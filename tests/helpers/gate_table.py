@@ -15,7 +15,7 @@ MS = 1_000_000
 PUBLISHING_NS = MS // 8
 
 
-What: TypeAlias = Literal["mode", "moved", "phase"]
+ChangeKind: TypeAlias = Literal["mode", "moved", "phase"]
 
 
 @dataclass(frozen=True)
@@ -23,14 +23,14 @@ class Change:
     """What changes in a gate's schedule from when on (ns): its mode, slots or phase."""
 
     from_ns: int
-    what: What
+    kind: ChangeKind
     value: int | str
 
     def put_into(self, queue: Queue) -> None:
         """Change the schedule of a gate."""
         if isinstance(self.value, str):
             assert queue.switch(self.value, self.from_ns)
-        elif self.what == "moved":
+        elif self.kind == "moved":
             queue.move_slots(self.value, self.from_ns)
         else:
             queue.set_phase(self.value, self.from_ns)
@@ -48,9 +48,9 @@ class Case:
     leave: tuple[int | str, ...] = ()
     late_ns: int = 0  # a thread that slept wakes up so late
 
-    def changes_of(self, what: What) -> list[Change]:
+    def changes_of(self, kind: ChangeKind) -> list[Change]:
         """Those of one kind."""
-        return [change for change in self.changes if change.what == what]
+        return [change for change in self.changes if change.kind == kind]
 
 
 @dataclass(frozen=True)
@@ -86,13 +86,15 @@ def _case(entry: dict[str, Any]) -> Case:
         gate=gate,
         arrivals=tuple((_ns(arrival), _ns(stamp)) for arrival, stamp in both),
         changes=tuple(
-            Change(_ns(time), what, value if isinstance(value, str) else _ns(value))
+            Change(_ns(time), kind, value if isinstance(value, str) else _ns(value))
             for time, change in entry.get("changes", ())
-            for what, value in change.items()
+            for kind, value in change.items()
         ),
         steps=tuple(_ns(time) for time in entry.get("steps", ())),
         name=entry["name"],
-        leave=tuple(one if isinstance(one, str) else _ns(one) for one in entry["leave"]),
+        leave=tuple(
+            instant if isinstance(instant, str) else _ns(instant) for instant in entry["leave"]
+        ),
     )
 
 
@@ -101,7 +103,7 @@ def walk(case: Case, publishing_ns: int = PUBLISHING_NS) -> list[Outcome]:
     queue, now = Queue(case.gate), 0
     for change in case.changes:
         change.put_into(queue)
-    found: dict[int, Outcome] = {}
+    outcomes: dict[int, Outcome] = {}
     coming, steps = deque(enumerate(case.arrivals)), deque(case.steps)
 
     def come_until(time: int) -> None:
@@ -111,7 +113,7 @@ def walk(case: Case, publishing_ns: int = PUBLISHING_NS) -> list[Outcome]:
                 steps.popleft()
                 queue.doubt_stamps(arrival)
             if (full := queue.arrive(b"", arrival, stamp, number)) is not None:
-                found[full.message.about] = Outcome(None, full.release)
+                outcomes[full.message.about] = Outcome(None, full.release)
 
     while coming or queue.waiting:
         if not queue.waiting:
@@ -130,9 +132,9 @@ def walk(case: Case, publishing_ns: int = PUBLISHING_NS) -> list[Outcome]:
                 release = release.dropping("replaced")
             elif case.gate.policy == "discard" and missed(case.gate, release, now):
                 release = replace(release.dropping("discarded"), overrun="discard")
-        found[oldest.about] = Outcome(None if release.dropped else now, release)
+        outcomes[oldest.about] = Outcome(None if release.dropped else now, release)
         queue.leave(release, now)
         now += 0 if release.dropped else publishing_ns
         queue.free_ns = now
         come_until(now)
-    return [found[number] for number in range(len(case.arrivals))]
+    return [outcomes[number] for number in range(len(case.arrivals))]

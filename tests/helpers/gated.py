@@ -65,8 +65,8 @@ class Stamping:
         """When its main thread ran, between two instants; ends it."""
         self.process.terminate()
         assert self.process.wait(timeout=60) == 0
-        found = json.loads(self.output.read_text())
-        return [(start, end) for start, end in found if after_ns <= start and end <= before_ns]
+        windows = json.loads(self.output.read_text())
+        return [(start, end) for start, end in windows if after_ns <= start and end <= before_ns]
 
 
 @contextlib.contextmanager
@@ -75,9 +75,9 @@ def stamping(
 ) -> Iterator[Stamping]:
     output = folder / f"windows-{time.monotonic_ns()}.json"
     script = Path(__file__).with_name("stamping_process.py")
-    other = [str(OTHER_CORE)] * with_another
+    other_core = [str(OTHER_CORE)] if with_another else []
     process = subprocess.Popen(
-        [sys.executable, str(script), str(seconds), str(output), str(core), *other],
+        [sys.executable, str(script), str(seconds), str(output), str(core), *other_core],
         stdout=subprocess.PIPE,
     )
     try:
@@ -140,8 +140,8 @@ def share_inside(
         )
         outside[number] = outside.get(number, 0) + max(0, length - inside)
         total += length
-    kept = sorted(outside.values())[: max(1, len(outside) * 9 // 10)]
-    return 1 - sum(kept) / max(1, total)
+    least = sorted(outside.values())[: max(1, len(outside) * 9 // 10)]
+    return 1 - sum(least) / max(1, total)
 
 
 def groups_left(owner_pid: int | None = None) -> list[Path]:

@@ -310,15 +310,15 @@ class Victim:
         from applied_plans import scheduling
         from gated import cpu_ns
 
-        pid, said = self.process.pid, []
+        pid, changes = self.process.pid, []
         if (now := scheduling(pid)) != self.before:
-            said.append(f"the node's scheduling is {now}, and was {self.before}")
+            changes.append(f"the node's scheduling is {now}, and was {self.before}")
         groups = [place.name for place in self.group.iterdir() if place.is_dir()]
-        said += [f"the group {name} is left" for name in groups]
+        changes += [f"the group {name} is left" for name in groups]
         ran = cpu_ns(pid)
         if not wait(lambda: cpu_ns(pid) > ran, 10):
-            said.append("the node does not run")
-        return said
+            changes.append("the node does not run")
+        return changes
 
     def end(self) -> None:
         self.process.kill()
@@ -386,13 +386,13 @@ def await_instant(
 def started(verb: str, words: list[str]) -> tuple[subprocess.Popen[bytes], str]:
     """Start a verb; return it, and what the environment of all its processes has in it."""
     name, mark = "CASE", uuid.uuid4().hex
-    with (WORK / "said").open("wb") as said:  # on a mount of this lane alone
+    with (WORK / "said").open("wb") as printed:  # on a mount of this lane alone
         process = subprocess.Popen(
             command(verb, words),
             env={**os.environ, name: mark},
             stdin=subprocess.DEVNULL,
-            stdout=said,
-            stderr=said,
+            stdout=printed,
+            stderr=printed,
         )
     return process, f"{name}={mark}"
 
@@ -520,8 +520,8 @@ def look_behind(case: Case, victim: Victim, marker: str, output: Path | None) ->
     if b"Traceback" in released.stderr:
         case.left.append(f"release: {released.stderr.decode(errors='replace')[-900:]}")
     case.left += orphans() + victim.changed()
-    if (said := output_of()) and b"Traceback" in said:
-        case.left += tracebacks(case, said)
+    if (printed := output_of()) and b"Traceback" in printed:
+        case.left += tracebacks(case, printed)
     for place in EMPTY:  # the folder of pages of a user stays where /run had no room
         of_user = f"chainshaper-{os.geteuid()}"
         case.left += [f"{file} is left" for file in place.iterdir() if file.name != of_user]
@@ -551,9 +551,9 @@ def remove_outputs() -> None:
 _FRAME = re.compile(r'File "([^"]+)"')
 
 
-def tracebacks(case: Case, said: bytes) -> Iterator[str]:
+def tracebacks(case: Case, printed: bytes) -> Iterator[str]:
     """Tracebacks of ours; those of Ctrl-C before our first line are noted as what they are."""
-    text = said.decode(errors="replace")
+    text = printed.decode(errors="replace")
     for trace in text.split("Traceback (most recent call last)")[1:]:
         frames = [name for name in _FRAME.findall(trace) if "/chainshaper/" in name]
         early = all(name.endswith(("chainshaper/__init__.py", "__main__.py")) for name in frames)

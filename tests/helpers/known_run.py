@@ -65,20 +65,20 @@ def known_run(
     timer = story.timer(nodes[0], period=PERIOD_NS, symbol="First<1>::tick()")
     second = story.subscription(nodes[1], "/t1")
     shaping = story.subscription(nodes[2], plan.shaping_node.input)
-    one = story.publisher(nodes[0], "/t1")
-    two = story.publisher(nodes[1], plan.shaping_node.input)
-    three = story.publisher(nodes[2], "/t2")
+    to_second = story.publisher(nodes[0], "/t1")
+    to_shaping = story.publisher(nodes[1], plan.shaping_node.input)
+    output = story.publisher(nodes[2], "/t2")
     for cycle in range(cycles):
         start = cycle * PERIOD_NS + MS
         sent = start + 4 * MS
-        story.runs(timer, start, sent + 1000, writes=((one, sent),))
+        story.runs(timer, start, sent + 1000, writes=((to_second, sent),))
         if cycle in untaken:
             continue
         passed = sent + (26 if cycle in overran else 11) * MS
         arrival = passed + MS
-        story.runs(second, sent + MS, passed + 1000, reads=sent, writes=((two, passed),))
+        story.runs(second, sent + MS, passed + 1000, reads=sent, writes=((to_shaping, passed),))
         out = arrival if cycle in overran else start + LATENCY_NS
-        story.runs(shaping, arrival, out + 1000, reads=passed, writes=((three, out),))
+        story.runs(shaping, arrival, out + 1000, reads=passed, writes=((output, out),))
         story.event(
             "gate_release",
             out,
@@ -101,7 +101,7 @@ def known_run(
         cores=(0, 1), period_ns=MS, threshold_ns=100_000, wakeups=600,
         median_lateness_ns=(20_000, 30_000), realtime=True,
     )  # fmt: skip
-    own = {
+    known = {
         "source": "live",
         "host": "robot",
         "clock_offset_ns": OFFSET,
@@ -110,5 +110,5 @@ def known_run(
         "threads": (ThreadInfo.model_validate(thread | scheduling),),
         "stall_meter": stall_meter,
     }
-    info = RecordingInfo.model_validate(own | facts)
+    info = RecordingInfo.model_validate(known | facts)
     return write_recording(folder, story.tables(), info)

@@ -26,10 +26,10 @@ def follow_only_children_of(ancestor: int) -> None:
     """From now on watches in this process follow these alone."""
     every = vars(watch_module)["memories"]
 
-    def own(*given: Any) -> Iterator[tuple[int, Any]]:
-        return (found for found in every(*given) if _born_of(found[0], ancestor))
+    def of_children(*given: Any) -> Iterator[tuple[int, Any]]:
+        return (memory for memory in every(*given) if _born_of(memory[0], ancestor))
 
-    setattr(watch_module, "memories", own)  # noqa: B010 - a name that it imports
+    setattr(watch_module, "memories", of_children)  # noqa: B010 - a name that it imports
 
 
 def program(code: str = "from chainshaper.cli import main; main()") -> str:

@@ -75,12 +75,12 @@ def real_time_threads(pids: list[int]) -> list[str]:
 
 
 def wait_for(
-    condition: Callable[[], bool], what: str, seconds: float = 20.0, pause: float = 0.02
+    condition: Callable[[], bool], event: str, seconds: float = 20.0, pause: float = 0.02
 ) -> None:
     """Wait until something has happened; a test that waits in vain fails, and says for what."""
     deadline = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < deadline, f"waited {seconds} s in vain for {what}"
+        assert time.monotonic() < deadline, f"waited {seconds} s in vain for {event}"
         time.sleep(pause)
 
 

@@ -80,8 +80,8 @@ def _why_not_traced() -> str | None:
         )
     if " ros2:rcl_init " in listed.stdout:
         return None
-    said = " ".join((listed.stdout + listed.stderr).split())
-    return f"LTTng here finds no trace points of this ROS 2: {said}"
+    printed = " ".join((listed.stdout + listed.stderr).split())
+    return f"LTTng here finds no trace points of this ROS 2: {printed}"
 
 
 @functools.cache
@@ -92,8 +92,8 @@ def _environment() -> dict[str, str] | None:
     environments = [dict(os.environ)] if "AMENT_PREFIX_PATH" in os.environ else []
     for setup in candidates:
         command = ["bash", "-c", 'source "$1" >&2 && env -0', "bash", setup]
-        said = subprocess.run(command, capture_output=True, check=False)
-        pairs = [line.split("=", 1) for line in said.stdout.decode().split("\0") if "=" in line]
+        sourced = subprocess.run(command, capture_output=True, check=False)
+        pairs = [line.split("=", 1) for line in sourced.stdout.decode().split("\0") if "=" in line]
         environments.append(dict(pairs))
     for environment in environments:
         command = ["python3", "-c", "import rclpy"]

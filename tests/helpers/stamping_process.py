@@ -33,19 +33,19 @@ def cpu_ns(tid: int | None) -> int:
 def main() -> None:
     seconds, output, core = float(sys.argv[1]), *sys.argv[2:4]
     for other_core in sys.argv[4:]:
-        other = threading.Thread(target=compute_on, args=(int(other_core), seconds), daemon=True)
-        other.start()
-        while cpu_ns(other.native_id) < 10_000_000:  # it has the lock, and is inside its call
+        beside = threading.Thread(target=compute_on, args=(int(other_core), seconds), daemon=True)
+        beside.start()
+        while cpu_ns(beside.native_id) < 10_000_000:  # it has the lock, and is inside its call
             time.sleep(0.005)
     os.sched_setaffinity(0, {int(core)})
-    told = []
-    signal.signal(signal.SIGTERM, lambda *_: told.append(True))
+    signals = []
+    signal.signal(signal.SIGTERM, lambda *_: signals.append(True))
     sys.stdout.write("ready\n")
     sys.stdout.flush()
     end = time.monotonic_ns() + int(seconds * 1e9)
     windows = []
     first = last = time.monotonic_ns()
-    while last < end and not told:
+    while last < end and not signals:
         now = time.monotonic_ns()
         if now - last > GAP_NS:
             windows.append((first, last))

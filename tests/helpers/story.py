@@ -74,12 +74,12 @@ class Story:
         symbol: str | None = None,
     ) -> Callback:
         timer, callback = self.handle(), Callback(node.pid, handle or self.handle())
-        at, it = (time, node.pid), {"timer_handle": timer}
-        self.event("rcl_timer_init", *at, **it, period=period)
-        self.event("rclcpp_timer_callback_added", *at, **it, callback=callback.handle)
+        at, handles = (time, node.pid), {"timer_handle": timer}
+        self.event("rcl_timer_init", *at, **handles, period=period)
+        self.event("rclcpp_timer_callback_added", *at, **handles, callback=callback.handle)
         if symbol:
             self.event("rclcpp_callback_register", *at, callback=callback.handle, symbol=symbol)
-        self.event("rclcpp_timer_link_node", *at, **it, node_handle=node.handle)
+        self.event("rclcpp_timer_link_node", *at, **handles, node_handle=node.handle)
         return callback
 
     def subscription(
@@ -94,13 +94,13 @@ class Story:
     ) -> Callback:
         rcl, rmw, rclcpp = self.handle(), self.handle(), self.handle()
         callback = Callback(node.pid, handle or self.handle(), rmw)
-        at, it = (time, node.pid), {"subscription_handle": rcl}
+        at, handles = (time, node.pid), {"subscription_handle": rcl}
         about: dict[str, Any] = {"node_handle": node.handle, "rmw_subscription_handle": rmw}
-        about |= {"topic_name": topic, "queue_depth": 10, **it}
+        about |= {"topic_name": topic, "queue_depth": 10, **handles}
         self.event("rcl_subscription_init", time, node.pid, **about)
         if callbackless:
             return callback
-        self.event("rclcpp_subscription_init", *at, **it, subscription=rclcpp)
+        self.event("rclcpp_subscription_init", *at, **handles, subscription=rclcpp)
         added = {"subscription": rclcpp, "callback": callback.handle}
         self.event("rclcpp_subscription_callback_added", *at, **added)
         if symbol:
@@ -144,14 +144,14 @@ class Story:
         return end
 
     def call(
-        self, what: str, end: Callback, time: int, number: int, tid: int | None = None, **more: Any
+        self, kind: str, end: Callback, time: int, number: int, tid: int | None = None, **more: Any
     ) -> None:
-        """``what``: send_request, take_request, send_response or take_response."""
-        role = "client" if what in ("send_request", "take_response") else "service"
+        """``kind``: send_request, take_request, send_response or take_response."""
+        role = "client" if kind in ("send_request", "take_response") else "service"
         about = {f"rmw_{role}_handle": end.rmw_subscription, "sequence_number": number, **more}
         if role == "service":
             about["client_gid"] = [about["client_gid"]] * 16
-        self.event(f"rmw_{what}", time, end.pid, tid, **about)
+        self.event(f"rmw_{kind}", time, end.pid, tid, **about)
 
     def start(self, callback: Callback, time: int, tid: int | None = None, intra: int = 0) -> None:
         about = {"callback": callback.handle, "is_intra_process": intra}
@@ -203,10 +203,10 @@ class Story:
 
     def tables(self) -> dict[str, pl.DataFrame]:
         """The event tables, each sorted by time; events at one time keep the order of telling."""
-        found = {}
+        tables = {}
         for name, rows in self.rows.items():
             types = {**events.COMMON_COLUMNS, **events.FIELDS[name]}
             types |= events.OPTIONAL_FIELDS.get(name, {})
             table = pl.DataFrame(rows, schema_overrides=types, infer_schema_length=None)
-            found[name] = table.sort("time", maintain_order=True)
-        return found
+            tables[name] = table.sort("time", maintain_order=True)
+        return tables

@@ -113,8 +113,8 @@ def build(prefix: Path, *flags: str, version: str = "8.2.3", compiler: str = "gc
     library = [str(_SOURCES / "tracetools.c"), "-shared", "-fPIC", "-o", str(program.tracetools)]
     subprocess.run([*gcc, *library], check=True)
     if "-DDISABLED" not in flags:
-        here = ["-L" + str(program.tracetools.parent), "-ltracetools", "-Wl,-rpath,$ORIGIN"]
-        application = [str(_SOURCES / "application.c"), *here, "-pthread"]
+        linking = ["-L" + str(program.tracetools.parent), "-ltracetools", "-Wl,-rpath,$ORIGIN"]
+        application = [str(_SOURCES / "application.c"), *linking, "-pthread"]
         subprocess.run([*gcc, *application, "-o", str(program.executable)], check=True)
     return program
 

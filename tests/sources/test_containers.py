@@ -19,6 +19,8 @@ from chainshaper.sources.system import NEXT_HOST
 
 pytestmark = [needs_namespaces, pytest.mark.waiting]
 
+ROUNDS = "100000"  # of the program: it runs until its container is left, however slow all else is
+
 
 def _running(
     stack: ExitStack,
@@ -59,7 +61,7 @@ def _assert_apart(recording: Path, pids: set[int]) -> None:
 def test_two_containers_are_recorded_by_the_library_in_front(tmp_path: Path) -> None:
     """In one of them root is another user than here."""
     environment = {"LD_PRELOAD": str(installed_library())}
-    command = built().command("chain", "60", "--ros-args")
+    command = built().command("chain", ROUNDS, "--ros-args")
     with ExitStack() as both:
         inside = [_running(both, command, environment, user=user) for user in (False, True)]
         assert [process.inner_pid for process in inside] == [1, 1]
@@ -87,7 +89,7 @@ def test_a_command_that_starts_a_container_is_recorded(tmp_path: Path) -> None:
 
 def test_two_containers_are_recorded_by_ebpf(tmp_path: Path) -> None:
     skip_without_bpftrace()
-    command = built().command("chain", "400", "--ros-args", "-r", "__node:=both")
+    command = built().command("chain", ROUNDS, "--ros-args", "-r", "__node:=both")
     with ExitStack() as both:
         inside = [_running(both, command) for _ in range(2)]
         pids = _recorded(tmp_path / "rec", "ebpf", inside)
@@ -101,7 +103,7 @@ def test_containers_of_one_image_are_recorded_once_each_by_ebpf(tmp_path: Path) 
     """Both see the image's file through an overlay of their own, as Docker has it: one inode."""
     skip_without_bpftrace()
     program = built()
-    command = program.command("chain", "40", "--ros-args", "-r", "__node:=both")
+    command = program.command("chain", ROUNDS, "--ros-args", "-r", "__node:=both")
     with ExitStack() as both:
         inside = [_running(both, command, overlaid=program.prefix) for _ in range(2)]
         _recorded(tmp_path / "rec", "ebpf", inside)

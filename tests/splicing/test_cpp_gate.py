@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from cpp_program import compiled
-from gate_table import PUBLISHING_NS, Case, Change, Outcome, What, cases, walk
+from gate_table import PUBLISHING_NS, Case, Change, ChangeKind, Outcome, cases, walk
 
 from chainshaper.robot.decision import DROPPED
 from chainshaper.robot.gate import (
@@ -52,14 +52,14 @@ def as_text(case: Case) -> str:
     words += [len(case.changes)]
     for change in case.changes:
         value = names.index(change.value) if isinstance(change.value, str) else change.value
-        words += [change.from_ns, CHANGED.index(change.what), value]
+        words += [change.from_ns, CHANGED.index(change.kind), value]
     words += [len(case.steps), *case.steps, PUBLISHING_NS, case.late_ns, len(case.arrivals)]
     words += [word for arrival, stamp in case.arrivals for word in (arrival, _or_dash(stamp))]
     return " ".join(map(str, words))
 
 
 def as_answer(case: Case, outcome: Outcome) -> str:
-    """What becomes of a message, as the driver prints it."""
+    """ChangeKind becomes of a message, as the driver prints it."""
     release, dash = outcome.release, _or_dash
     names = [] if case.gate.modes is None else list(case.gate.modes.slots)
     words = [
@@ -107,7 +107,7 @@ def _any_case(draw: random.Random) -> Case:
     late_ns = draw.choice([0, 0, draw.randint(1, 40) * scale])
     arrivals = tuple(zip(times, stamps, strict=True))
     earliest, latest = -slots[0][0], gate.cycle_ns - slots[-1][1]
-    limits: dict[What, tuple[int, int]] = {
+    limits: dict[ChangeKind, tuple[int, int]] = {
         "moved": (earliest, latest),
         "phase": (-100 * scale, 100 * scale),
     }

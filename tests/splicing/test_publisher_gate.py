@@ -197,7 +197,7 @@ def test_it_does_what_the_table_of_all_gates_says(run: Callable[..., Run]) -> No
     unmoved = [
         case
         for case in cases()
-        if not case.steps and all(change.what == "mode" for change in case.changes)
+        if not case.steps and all(change.kind == "mode" for change in case.changes)
     ]
     left = {f"/t{number}": case for number, case in enumerate(filter(in_real_time, unmoved))}
     assert len(left) > len(unmoved) * 0.8

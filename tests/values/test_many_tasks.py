@@ -162,7 +162,7 @@ def test_a_function_that_fails_ends_the_run_with_its_name(
 ) -> None:
     application = _application(tmp_path, monkeypatch, numbers="sums:squares")
     with pytest.raises(OperationError, match=r"sums:squares failed at .*executor.py:\d+: TypeErr"):
-        run_application(application, tmp_path / "rec", cycles=3, realtime=False)
+        run_application(application, tmp_path / "rec", cycles=200, realtime=False)
     assert not (tmp_path / "rec").exists()
 
 
@@ -174,7 +174,7 @@ def test_a_function_that_fails_in_another_thread_ends_the_run_as_well(
     application = load_application(tmp_path / "beside.yaml")
     said = r"ended with code 1 .*: sums:fails_beside\w+ failed at .*sums.py:\d+: ZeroDivisionError"
     with pytest.raises(OperationError, match=said):
-        run_application(application, tmp_path / "rec", cycles=20, realtime=False)
+        run_application(application, tmp_path / "rec", cycles=200, realtime=False)
     assert not (tmp_path / "rec").exists()
 
 

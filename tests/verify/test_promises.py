@@ -121,7 +121,7 @@ def test_cycles_in_which_a_chain_did_not_begin_are_missed(tmp_path: Path) -> Non
     measured = measure_latency(recording)
     outputs = outputs_due(measured.analysis, measured.plan)
     assert (outputs.due, outputs.late, outputs.absent) == (60, 0, {"not begun": 10})
-    assert "10 of 60 outputs missed (10 not begun), none expected" in _text(measured)
+    assert "10 of 60 outputs missed (10 not begun), 2 at most expected" in _text(measured)
     assert outputs_due(measured.analysis).share == pytest.approx(10 / 60)
 
 

@@ -186,6 +186,16 @@ class Profile:
         return np.minimum(measured, self.longest_ns)
 
     @property
+    def planned_steps_ns(self) -> NDArray[np.int64]:
+        """``graph_steps_ns`` where some callbacks are on branches, else ``steps_ns``."""
+        return self.graph_steps_ns if self.graph_steps_ns.size else self.steps_ns
+
+    @property
+    def every_planned_step_ns(self) -> NDArray[np.int64]:
+        """The same of all cycles; columns as those of ``planned_steps_ns``."""
+        return self.every_graph_step_ns if self.graph_steps_ns.size else self.every_step_ns
+
+    @property
     def starts(self) -> NDArray[np.int64]:
         """When each cycle began, from the beginning of the recording."""
         given = self.starts_ns

@@ -247,8 +247,8 @@ def _places(profiles: Sequence[Profile], cores: Sequence[int]) -> dict[str, int]
     places: dict[str, int] = {}
     for profile in profiles:
         apart = _apart(profile)
-        steps = apart.graph_steps_ns if apart.graph_steps_ns.size else apart.steps_ns
-        places |= stage_places(_work(apart, steps), profile.period_ns, len(cores))
+        work = _work(apart, apart.planned_steps_ns)
+        places |= stage_places(work, profile.period_ns, len(cores))
     return places
 
 
@@ -580,11 +580,12 @@ def _refuse_full_cores(plan: ChainPlan, profile: Profile) -> None:
     In each cycle all callbacks run, for as many instances. What is not done then delays the next
     cycle's, and so on: the outputs of a core that is full once stay late.
     """
-    with_branches = bool(profile.graph_steps_ns.size)
-    steps = profile.every_graph_step_ns if with_branches else profile.every_step_ns
+    steps = profile.every_planned_step_ns
     if not steps.size:
         return
-    nodes = [step.node for step in profile.callbacks] if with_branches else profile.nodes
+    nodes = profile.nodes
+    if profile.graph_steps_ns.size:
+        nodes = tuple(callback.node for callback in profile.callbacks)
     busy_ns = Counter[int]()
     for node, longest_ns in zip(nodes, steps.max(axis=0).tolist(), strict=True):
         busy_ns[profile.core_of.get(node, DEFAULT_CORE)] += longest_ns
@@ -599,10 +600,9 @@ def _refuse_full_cores(plan: ChainPlan, profile: Profile) -> None:
 
 
 def _pipelined(plan: ChainPlan, profile: Profile, cores: Sequence[int] | None) -> ChainPlan:
-    with_branches = bool(profile.graph_steps_ns.size)
-    steps = profile.graph_steps_ns if with_branches else profile.steps_ns
+    steps = profile.planned_steps_ns
     if profile.all_disturbed:
-        every = profile.every_graph_step_ns if with_branches else profile.every_step_ns
+        every = profile.every_planned_step_ns
         steps = every[_work(profile, every).finished_ns[:, -1] <= profile.longest_ns]
     reception, room_ns = profile.reception, profile.others_ns
     if reception is not None and reception.core in (None, *(cores or profile.core_of.values())):

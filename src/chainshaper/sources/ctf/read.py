@@ -1,9 +1,9 @@
 """Count events, and read them into data frames.
 
 Pass 1 (`_File.count`) steps over every event of a file and counts, so that the row of each event is
-known. Pass 2 (`_filled`) writes the wanted events, chunk by chunk of the files, to their rows; then
-each table is sorted by time. Both passes are C++ (core/ctf), and run on several threads. Of a large
-trace only some chunks are in memory at once.
+known. Pass 2 (`_write_events`) writes the wanted events, chunk by chunk of the files, to their
+rows; then each table is sorted by time. Both passes are C++ (core/ctf), and run on several threads.
+Of a large trace only some chunks are in memory at once.
 """
 
 import mmap
@@ -122,10 +122,10 @@ def read_events(
         rows = [np.zeros(len(wanted.tables), np.int64), *(file.rows for file in files)]
         first_rows = np.cumsum(rows, axis=0)
         columns = [
-            _Columns(number, table, int(first_rows[-1][number]) if files else 0)
+            _TableColumns(number, table, int(first_rows[-1][number]) if files else 0)
             for number, table in enumerate(wanted.tables)
         ]
-        texts = _filled(pool, files, first_rows, columns, progress)
+        texts = _write_events(pool, files, first_rows, columns, progress)
         parts = _parts(pool, columns, texts)
     try:
         events = Events(_frames(parts))
@@ -216,11 +216,11 @@ def _warnings(files: Sequence[_File]) -> Iterator[str]:
 # Pass 2
 
 
-def _filled(
+def _write_events(
     pool: ThreadPoolExecutor,
     files: list[_File],
     first_rows: NDArray[np.int64],
-    columns: list["_Columns"],
+    columns: list["_TableColumns"],
     progress: ShareDone,
 ) -> list[bytes]:
     """Write the events of all chunks to the tables (pass 2).
@@ -254,12 +254,16 @@ def _filled(
 # Columns
 
 
-class _Columns:
-    """The arrays of one table of so many ``rows``: time, cpu (or nothing) and its columns' values.
+class _TableColumns:
+    """The arrays that the decoder writes a table of events to.
 
-    Large ones have memory of their own, so that a frame that is made of some of them keeps no
-    others. The small ones of a table are parts of one piece of memory, large enough for huge pages:
-    page faults would else be a third of all work.
+    * ``time``: when each event happened (ns), int64.
+    * ``cpu``: on which core, int32; empty where the trace does not say.
+    * ``values``: an array for each column of the table, of the column's type; codes for texts.
+
+    Each has ``rows`` entries. Large arrays have memory of their own, so that a frame that is made
+    of some of them keeps no others. The small ones of a table are parts of one piece of memory,
+    large enough for huge pages: page faults would else be a third of all work.
     """
 
     def __init__(self, number: int, table: Table, rows: int) -> None:
@@ -335,7 +339,7 @@ def _returned_memory(size: int) -> NDArray[np.uint8]:
 
 
 def _parts(
-    pool: ThreadPoolExecutor, columns: list[_Columns], known: list[bytes]
+    pool: ThreadPoolExecutor, columns: list[_TableColumns], known: list[bytes]
 ) -> dict[str, list[pl.DataFrame]]:
     """Event → the frames of its tables; codes of texts are of what is ``known``."""
     texts = [text.decode(errors="backslashreplace") for text in known]
