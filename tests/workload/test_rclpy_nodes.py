@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from processes import wait_for
@@ -23,6 +24,7 @@ STAND_IN = """\
 #!{python}
 import signal, sys
 from pathlib import Path
+from typing import Any
 signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
 Path(sys.argv[2]).with_suffix(".started").touch()
 signal.pause()
@@ -51,7 +53,7 @@ def test_nodes_get_the_times_of_the_live_workload_and_their_scheduling(tmp_path:
     assert [node["scheduling"] for node in described(fair)] == [None] * 4
 
 
-def described(nodes: WrittenNodes) -> list[dict[str, object]]:
+def described(nodes: WrittenNodes) -> list[dict[str, Any]]:
     return [json.loads(file.with_suffix(".json").read_text()) for file in nodes.ready]
 
 

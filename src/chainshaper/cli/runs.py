@@ -101,7 +101,7 @@ def demo(
 def _show_demonstration(shown: "Demonstration", *, verbose: bool) -> None:
     """Show what a demonstration has shown on one screen; ``verbose`` shows all tables."""
     from chainshaper.reporting.overviews import callback_table, plan_table
-    from chainshaper.reporting.screen import comparison_lines, unplanned_lines
+    from chainshaper.reporting.screen import compared_before, comparison_lines, unplanned_lines
 
     before, folder = shown.before.recording, shown.folder
     if verbose:
@@ -122,6 +122,9 @@ def _show_demonstration(shown: "Demonstration", *, verbose: bool) -> None:
     if shown.longer:
         out.show_line("  ! Stalls hit more than a third of the cycles: it measured for longer.")
     out.show_line("")
+    earlier = sorted(Path().glob("chainshaper-demo-2*/comparison.json"))[-1:]
+    if len(shown.shaped) > 1 and earlier:
+        out.show(*compared_before(earlier[0]))
     look = "report.html" if shown.comparison is not None else "before"
     out.show_line(f"  Look        {folder / look}")
     out.show_line(
