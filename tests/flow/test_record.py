@@ -247,20 +247,25 @@ def test_a_full_disk_is_named(node: Path, full_disk: Path) -> None:
 @pytest.mark.ros2
 @pytest.mark.usefixtures("in_ros2")
 @pytest.mark.parametrize(
-    "program",
+    ("program", "source"),
     [
-        f"python3 {Path(__file__).with_name('chatting.py')}",
+        (f"python3 {Path(__file__).with_name('chatting.py')}", "preload"),
         pytest.param(
-            "ros2 run demo_nodes_cpp", marks=pytest.mark.ros2("demo_nodes_cpp", "ros2run")
+            *("ros2 run demo_nodes_cpp", "lttng"),
+            marks=pytest.mark.ros2("demo_nodes_cpp", "ros2run"),
         ),
     ],
     ids=["rclpy", "rclcpp"],
 )
-def test_real_nodes_are_recorded_with_types_and_qos(tmp_path: Path, program: str) -> None:
+def test_real_nodes_are_recorded_with_types_and_qos(
+    tmp_path: Path, program: str, source: str
+) -> None:
     path = tmp_path / "rec"
     nodes = f"{program} talker --ros-args -r __node:=talker & "
     nodes += f"{program} listener --ros-args -r __node:=listener"
-    json_of_recording("-o", path, "--duration", "8s", "--", "sh", "-c", nodes)
+    words = ("-o", path, "--source", source, "--duration", "8s")
+    made = called("record", *words, "--", "sh", "-c", nodes)
+    assert made.code == 0, made.err
     info = open_recording(path).info
     assert sorted(info.processes.values()) == ["/listener", "/talker"]
     chatter = {one.kind: one for one in info.endpoints if one.topic == "/chatter"}
