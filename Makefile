@@ -108,7 +108,7 @@ experiments: .venv/.ready-dev
 	.venv/bin/python experiments/render.py $(if $(filter 0,$(LIVE)),--simulated)
 
 docs: .venv/.ready-dev
-	.venv/bin/mkdocs build --strict
+	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --strict
 
 # What is compiled: the native library, and what stands in front of ROS 2 (core/CMakeLists.txt). Where
 # some of it has changed, scripts/setup builds again, and only that.

@@ -27,9 +27,10 @@ from command_line import Finished, called, json_of
 from cores import cores
 
 from chainshaper import load_plan, open_recording
+from chainshaper.cli.app import GROUPS, VERBS
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 CONSOLE = re.compile(r"```console\n(.*?)```", re.DOTALL)
 YAML_EXAMPLE = re.compile(r"```yaml\n(name: .*?)```", re.DOTALL)
 PYTHON = re.compile(r"```python\n(.*?)```", re.DOTALL)
@@ -54,7 +55,9 @@ def marks_of(page: Path) -> list[pytest.MarkDecorator]:
 
 
 PAGES_WITH_COMMANDS = [
-    pytest.param(page, id=page.name, marks=marks_of(page)) for page in PAGES if commands(page)
+    pytest.param(page, id=str(page.relative_to(ROOT)), marks=marks_of(page))
+    for page in PAGES
+    if commands(page)
 ]
 
 
@@ -201,6 +204,33 @@ def test_the_python_example_about_several_chains_runs(tmp_path: Path, recorded: 
         run = executed(command, tmp_path, recorded)
         assert run.code == 0, run.err
     assert len(load_plan(tmp_path / "planned.yaml").chains) == 2
+
+
+def test_each_verb_has_a_page_with_its_options_of_today() -> None:
+    pages = sorted(page.stem for page in (ROOT / "docs/verbs").glob("*.md"))
+    assert pages == sorted(VERBS)
+    checked = subprocess.run(
+        [sys.executable, ROOT / "scripts/verb-pages", "--check"], capture_output=True, check=False
+    )
+    assert checked.returncode == 0, f"run scripts/verb-pages for {checked.stdout.decode()}"
+    for verb in VERBS:
+        example = (ROOT / f"docs/verbs/{verb}.md").read_text().partition("## Example\n")[2]
+        assert f"chainshaper {verb} " in example or f"chainshaper {verb}\n" in example
+        assert "## Exit codes\n" in example
+        assert "](../" in example.partition("## How to use it\n")[2]
+
+
+def test_pages_that_explain_are_short() -> None:
+    for name in ("shaping_node", "distributions", "plans", "overruns"):
+        assert len((ROOT / f"docs/{name}.md").read_text().split()) <= 1500
+
+
+def test_the_site_builds_without_warnings(tmp_path: Path) -> None:
+    """It has every page in its navigation, and no link that leads nowhere."""
+    built = executed(f"mkdocs build --strict -d {tmp_path}", ROOT, tmp_path)
+    assert built.code == 0, built.err
+    verbs = re.findall(r"verbs/(\w+)\.md", (ROOT / "mkdocs.yml").read_text())
+    assert verbs == " ".join(GROUPS.values()).split()
 
 
 def test_links_between_pages_lead_somewhere() -> None:

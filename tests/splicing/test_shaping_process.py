@@ -133,7 +133,8 @@ def test_a_core_is_cleared_for_delivering_threads_that_have_names(
 
 
 def test_every_parameter_is_documented() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "shaping_node.md").read_text()
+    docs = Path(__file__).parents[2] / "docs"
+    text = (docs / "shaping_node.md").read_text() + (docs / "throttler.md").read_text()
     throttled = {"inputs", "outputs", "period_ns"}
     assert [name for name in PARAMETERS if f"`{name}`" not in text] == sorted(throttled)
 

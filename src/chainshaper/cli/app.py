@@ -14,7 +14,7 @@ from typer import Abort
 from typer.core import TyperArgument, TyperCommand, TyperGroup
 from typer.main import get_command
 
-__all__ = ["USAGE_ERROR", "VERBS", "Abort", "app"]
+__all__ = ["GROUPS", "USAGE_ERROR", "VERBS", "Abort", "app"]
 
 USAGE_ERROR: Any = typer.BadParameter.__base__
 """What Typer raises where a command line is wrong; the name of its module changes."""
@@ -74,17 +74,20 @@ class _PlainCommand(TyperCommand):
             piece.strip("{}").replace("}...", "...") for piece in super().collect_usage_pieces(ctx)
         ]
 
-    def format_options(self, ctx: Any, formatter: Any) -> None:
-        panels: dict[str, list[tuple[str, str]]] = {}
+    def panels(self, ctx: Any) -> dict[str, list[Any]]:
+        """Return all parameters that help has, by the panel that they stand in."""
+        panels: dict[str, list[Any]] = {}
         for parameter in self.get_params(ctx):
             usual = "Arguments" if isinstance(parameter, TyperArgument) else "Options"
-            record = parameter.get_help_record(ctx)
-            if record is not None:
+            if parameter.get_help_record(ctx) is not None:
                 panel = getattr(parameter, "rich_help_panel", None) or usual
-                panels.setdefault(panel, []).append(record)
-        for title, records in panels.items():
+                panels.setdefault(panel, []).append(parameter)
+        return panels
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        for title, parameters in self.panels(ctx).items():
             with formatter.section(title):
-                formatter.write_dl(records)
+                formatter.write_dl([parameter.get_help_record(ctx) for parameter in parameters])
 
 
 class _Verb(TyperCommand):
@@ -96,10 +99,14 @@ class _Verb(TyperCommand):
     def get_short_help_str(self, limit: int = 45) -> str:  # noqa: ARG002 - it is not cut off
         return " ".join(str(self._function().__doc__).partition("\n\n")[0].split())
 
-    def make_context(self, *values: Any, **more: Any) -> Any:
+    def imported(self) -> Any:
+        """Return the verb with its options, from its module."""
         alone = typer.Typer(add_completion=False, rich_markup_mode=None, context_settings=_SETTINGS)
         alone.command(self.name, cls=_PlainCommand)(self._function())
-        return get_command(alone).make_context(*values, **more)
+        return get_command(alone)
+
+    def make_context(self, *values: Any, **more: Any) -> Any:
+        return self.imported().make_context(*values, **more)
 
 
 _root = typer.Typer(rich_markup_mode=None, context_settings=_SETTINGS)

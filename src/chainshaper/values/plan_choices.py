@@ -152,5 +152,5 @@ class Wishes:
         "A node outside the chain that runs when none of its servers does, in a server that is"
         " open all the time (may be repeated).", "More of the graph", "NODE")] = ()
     with_receivers: Annotated[bool, Option(
-        "Give nodes that subscribe to the shaped output SCHED_FIFO below all servers, while"
-        " the plan is in force.", flag="--receivers/--no-receivers")] = True
+        "Give nodes that subscribe to the shaped output SCHED_FIFO, in the place that the plan"
+        " has for them, while it is in force.", flag="--receivers/--no-receivers")] = True
