@@ -93,7 +93,7 @@ def test_a_node_that_fails_is_an_error_with_what_it_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", "100000")
-    with pytest.raises(OperationError, match="its nodes said last: .*omain"):
+    with pytest.raises(OperationError, match=r"its nodes said last: .*omain"):
         run_in_ros(small_chain(tmp_path), tmp_path / "recording", cycles=CYCLES)
     assert {path.name for path in tmp_path.iterdir()} <= {"small_chain.yaml", "recording"}
 
