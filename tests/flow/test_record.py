@@ -244,28 +244,12 @@ def test_a_full_disk_is_named(node: Path, full_disk: Path) -> None:
     assert "rec" not in files_in(full_disk)
 
 
-@pytest.mark.ros2
+@pytest.mark.ros2("demo_nodes_cpp", "ros2run")
 @pytest.mark.usefixtures("in_ros2")
-@pytest.mark.parametrize(
-    ("program", "source"),
-    [
-        (f"python3 {Path(__file__).with_name('chatting.py')}", "preload"),
-        pytest.param(
-            *("ros2 run demo_nodes_cpp", "lttng"),
-            marks=pytest.mark.ros2("demo_nodes_cpp", "ros2run"),
-        ),
-    ],
-    ids=["rclpy", "rclcpp"],
-)
-def test_real_nodes_are_recorded_with_types_and_qos(
-    tmp_path: Path, program: str, source: str
-) -> None:
+def test_real_nodes_are_recorded_with_types_and_qos(tmp_path: Path) -> None:
     path = tmp_path / "rec"
-    nodes = f"{program} talker --ros-args -r __node:=talker & "
-    nodes += f"{program} listener --ros-args -r __node:=listener"
-    words = ("-o", path, "--source", source, "--duration", "8s")
-    made = called("record", *words, "--", "sh", "-c", nodes)
-    assert made.code == 0, made.err
+    nodes = "ros2 run demo_nodes_cpp talker & ros2 run demo_nodes_cpp listener"
+    json_of_recording("-o", path, "--duration", "8s", "--", "sh", "-c", nodes)
     info = open_recording(path).info
     assert sorted(info.processes.values()) == ["/listener", "/talker"]
     chatter = {one.kind: one for one in info.endpoints if one.topic == "/chatter"}
