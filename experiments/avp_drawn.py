@@ -111,6 +111,11 @@ def _described(times: dict[str, NDArray[np.int64]]) -> Application:
         "fusion": {"callbacks": [reads(filtered, "fusion", fused)]},
         "voxel_grid": {"callbacks": [reads(fused, "voxel grid", small)]},
         "localizer": {"callbacks": [reads(small, "localizer", "/localization/pose")]},
+        "actuator": {
+            "callbacks": [
+                {"subscription": "/localization/pose", "execution": {"constant": "100us"}}
+            ]
+        },
     }
     for core in (0, 1):
         nodes[f"interference_{core}"] = {

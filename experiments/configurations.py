@@ -195,7 +195,9 @@ def live(
 
 
 def first_cycles(run: Run, cycles: int) -> Run:
-    return replace(run, latency_ns=run.latency_ns[:cycles], disturbed=run.disturbed[:cycles])
+    reception = None if run.reception_ns is None else run.reception_ns[:cycles]
+    latency, disturbed = run.latency_ns[:cycles], run.disturbed[:cycles]
+    return replace(run, latency_ns=latency, disturbed=disturbed, reception_ns=reception)
 
 
 @dataclass(frozen=True)
@@ -275,12 +277,14 @@ def stood_still(recording: Recording) -> bool:
 
 def joined(blocks: Sequence[Run], repeats: int) -> Run:
     """The blocks of one configuration as one run."""
+    receptions = [one.reception_ns for one in blocks if one.reception_ns is not None]
     return replace(
         blocks[0],
         latency_ns=np.concatenate([one.latency_ns for one in blocks]),
         disturbed=np.concatenate([one.disturbed for one in blocks]),
         block=np.repeat(np.arange(len(blocks)), [one.latency_ns.size for one in blocks]),
         repeats=repeats,
+        reception_ns=np.concatenate(receptions) if len(receptions) == len(blocks) else None,
     )
 
 
@@ -300,13 +304,15 @@ def latencies_of(
 
     ``column`` is where it was recorded; by default, the recording tells.
     """
-    frame = measure_latency(recording, chain).analysis.traversals
-    frame = frame.filter(pl.col("start") >= since_ns).sort("start")
+    analysis = measure_latency(recording, chain).analysis
+    frame = analysis.traversals.filter(pl.col("start") >= since_ns).sort("start")
+    received = analysis.subscriber is not None
     return Run(
         name,
         column or ("live" if recording.info.source == "live" else "simulated"),
         latency_ns=frame["latency_ns"].fill_null(-1).to_numpy(),
         disturbed=frame["disturbed"].to_numpy(),
+        reception_ns=frame["reception_ns"].fill_null(-1).to_numpy() if received else None,
     )
 
 

@@ -216,7 +216,7 @@ def main() -> None:
     save(
         "figure_9",
         "Figure 9: a graph of 18 callbacks on two cores",
-        lines(runs),
+        lines,
         runs=runs,
         pictures=pictures,
         notes=NOTES,

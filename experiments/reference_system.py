@@ -34,9 +34,10 @@ import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -59,10 +60,10 @@ from results import (
     Line,
     Run,
     Value,
-    earlier_lines,
     earlier_runs,
     figure,
     figures_of,
+    machines_of,
     save,
     value_text,
 )
@@ -246,34 +247,52 @@ def value_of(what: str, latency_ns: NDArray[np.int64]) -> Value:
 
 def lines_of_run(run: Run) -> Iterator[Line]:
     """The figures of one run, of undisturbed cycles and of all that came to an end."""
+    about: dict[str, Any] = {"simulated": None, "live": None, "machines": machines_of([run])}
     for what in WHATS:
         of = partial(value_of, what)
         values, intervals = figures_of(run, of, of)
-        yield Line(f"{run.name}: {what}", "ms", None, None, None, **values, intervals=intervals)
+        yield Line(f"{run.name}: {what}", "ms", None, **about, **values, intervals=intervals)
 
 
-def runs_and_lines(
-    found: Mapping[str, tuple[Sequence[Block], int]],
-) -> tuple[list[Run], list[Line]]:
-    """All that is saved."""
-    runs, lines = list[Run](), list[Line]()
-    for name, (blocks, repeats) in found.items():
-        own = [joined([one.latency for one in blocks], repeats)]
-        own += [joined([one.printed[what] for one in blocks], repeats) for what in PRINTED]
-        runs += own
-        for run in own:
-            lines += lines_of_run(run)
-        counts = {
-            f"{name}: without an end": int((own[0].latency_ns < 0).sum()),
-            f"{name}, printed hot path: drops": sum(one.drops for one in blocks),
-        }
-        lines += [Line(what, "cycles", None, None, None, ros_all=n) for what, n in counts.items()]
+def runs_of(found: Mapping[str, tuple[Sequence[Block], int]]) -> list[Run]:
+    """Each configuration's latencies, and what the program printed of itself.
+
+    Drops and what a node computes are facts of the run.
+    """
+    runs = list[Run]()
+    for blocks, repeats in found.values():
         crunch = float(np.mean([one.response_ns for one in blocks])) / MS
-        lines.append(
-            Line(f"{name}: a node's mean response", "ms", None, None, None, ros_all=crunch)
-        )
-    return runs, lines
+        drops = sum(one.drops for one in blocks)
+        latency = joined([one.latency for one in blocks], repeats)
+        runs.append(replace(latency, facts={DROPPED: drops, RESPONSE: crunch}))
+        runs += [joined([one.printed[what] for one in blocks], repeats) for what in PRINTED]
+    return runs
 
+
+def lines(runs: Sequence[Run]) -> list[Line]:
+    """All figures of all runs, one configuration after the other."""
+    made = list[Line]()
+    for one in CONFIGURATIONS:
+        configured = [run for run in runs if run.name.partition(",")[0] == one.name]
+        for run in configured:
+            made += lines_of_run(run)
+        for run in configured:
+            if run.name == one.name:
+                about: dict[str, Any] = {"simulated": None, "live": None, "paper": None}
+                about |= {"machines": machines_of([run])}
+                lost = int((run.latency_ns < 0).sum())
+                made.append(Line(f"{one.name}: without an end", "cycles", ros_all=lost, **about))
+                for fact, what, unit in FACTS:
+                    value = run.facts.get(fact)
+                    made.append(Line(f"{one.name}{what}", unit, ros_all=value, **about))
+    return made
+
+
+DROPPED, RESPONSE = "printed drops", "a node's mean response (ms)"
+FACTS = (
+    (DROPPED, ", printed hot path: drops", "cycles"),
+    (RESPONSE, ": a node's mean response", "ms"),
+)
 
 COLUMNS = (
     ("maximum", ": maximum"),
@@ -343,9 +362,7 @@ def main() -> None:
     missing = "" if given.simulated else missing_here()
     if missing or given.simulated:
         print(f"not measured: {missing}" if missing else "not measured")
-        if (given.results / f"{NAME}.json").exists():
-            lines = earlier_lines(NAME, "", given.results)
-            runs = earlier_runs(NAME, "ros", folder=given.results)
+        if runs := earlier_runs(NAME, "ros", folder=given.results):
             save(NAME, title, lines, runs=runs, folder=given.results)
         return
     benchmark = executables() / "number_cruncher_benchmark"
@@ -355,8 +372,8 @@ def main() -> None:
     with ExitStack() as until:
         keep = given.keep or Path(until.enter_context(tempfile.TemporaryDirectory()))
         found = in_turns(keep, seconds=given.seconds, blocks=given.blocks)
-    runs, lines = runs_and_lines(found)
-    said = notes(lines, found["shaped"][0], given.seconds)
+    runs = runs_of(found)
+    said = notes(lines(runs), found["shaped"][0], given.seconds)
     save(NAME, title, lines, runs=runs, notes=said, folder=given.results)
     print(said)
 

@@ -1,10 +1,11 @@
-"""What every experiment hands in: numbers beside the paper's, and the latencies they come from.
+"""What every experiment hands in: latencies of runs, and the numbers that follow from them.
 
 An experiment of the paper has a value for each number in up to five columns: the paper's, and ours
-by simulation, live, and on ROS 2 over two middlewares. :class:`Line` is one such number,
-:class:`Run` the latencies of one run. :func:`save` prints the lines of one table or figure and
-writes `results/NAME.json`, with the cycles of every run and how many of them the machine disturbed,
-beside `results/NAME.parquet`, which has the latencies that the numbers can be recomputed from.
+by simulation, live, and on ROS 2 over two middlewares. :class:`Run` is the latencies of one run,
+:class:`Line` one number. Every experiment has a function ``lines``, which makes its lines from its
+runs and from nothing else. :func:`save` writes the runs: `results/NAME.parquet` has every cycle,
+`results/NAME.json` what else is known of each run, and the lines for who reads them elsewhere. The
+page is made from the runs alone (:func:`lines_from`).
 
 Measured values cost minutes and cannot be had on every machine. An experiment that was only
 simulated therefore takes the measured runs of the last time from its files (:func:`earlier_runs`),
@@ -14,10 +15,11 @@ and the pictures (files that end in the column, such as `_live.png`), with day a
 import json
 import os
 import platform
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from datetime import date
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -41,11 +43,12 @@ __all__ = [
     "Run",
     "Value",
     "cell",
-    "earlier_lines",
     "earlier_runs",
     "figure",
     "figures_of",
+    "lines_from",
     "lines_of",
+    "machines_of",
     "save",
     "value_text",
 ]
@@ -66,18 +69,17 @@ OURS: tuple[Column, ...] = ("simulated", "live", *ROS)
 COLUMNS = {
     "paper": "paper",
     "simulated": "simulated",
-    "simulated_all": "all cycles",
     "live": "live",
-    "live_all": "all cycles",
     "ros": "ROS 2, Cyclone DDS",
-    "ros_all": "all cycles",
     "fast": "ROS 2, Fast DDS",
-    "fast_all": "all cycles",
 }
-"""The columns of values: those of undisturbed cycles in time, and beside them those of all."""
+"""The columns of values."""
 
 MARK = "○"
 """Stands behind a value that says nothing about how near ours is to the paper's."""
+
+AT_RECEIVER = "jitter, received"
+"""The jitter until the callback of the output's receiver begins."""
 
 RESAMPLES, STRETCH = 2_000, 10
 """Bootstrap: how often drawn again, and how many consecutive cycles are drawn together."""
@@ -92,7 +94,7 @@ class Line:
     ``live``, ``ros`` and ``fast`` are over undisturbed cycles in time; the values with ``_all``
     over all that came to an end, late ones too. ``intervals`` hold 95 % of the measured values of
     a column that are drawn again. ``no_evidence`` says of a column why its value does not count as
-    one that is near. ``measured`` says when and where the live value was, if it is of no run here.
+    one that is near. ``machines`` says of a measured column when and where it was measured.
     """
 
     what: str
@@ -107,7 +109,7 @@ class Line:
     ros_all: Value = None
     fast: Value = None
     fast_all: Value = None
-    measured: str | None = None
+    machines: Mapping[Column, str] = field(default_factory=dict)
     intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     no_evidence: Mapping[Column, str] = field(default_factory=dict)
 
@@ -119,7 +121,10 @@ class Run:
     ``latency_ns`` is −1 where a cycle came to no end (lost, discarded, merged with another);
     ``disturbed`` marks cycles that the machine disturbed, none of them in a simulation. ``block``
     counts the stretches in which a configuration took turns with others; ``repeats`` of these were
-    measured again, because the machine stood still. ``measured`` is when and where, now by default.
+    measured again, because the machine stood still. ``measured`` is when and where: as it is saved.
+    ``reception_ns`` is the latency until the callback of the output's receiver begins, −1 where
+    none did; None if nobody received, or it was not kept. ``facts`` are numbers of the run that are
+    no figures of its cycles, and its slots.
     """
 
     name: str
@@ -129,6 +134,8 @@ class Run:
     block: NDArray[np.int64] | None = None
     repeats: int = 0
     measured: str = ""
+    reception_ns: NDArray[np.int64] | None = None
+    facts: Mapping[str, Value] = field(default_factory=dict)
 
     @property
     def undisturbed_ns(self) -> NDArray[np.int64]:
@@ -152,7 +159,7 @@ def figure(what: str, latency_ns: NDArray[np.int64], late_from_ns: float = np.in
     in_time = latency_ns[~late] / MS
     if not in_time.size:
         return None
-    if what == "jitter":
+    if what.startswith("jitter"):
         return float(np.ptp(in_time))
     return float(in_time.max() if what == "maximum" else in_time.mean())
 
@@ -212,9 +219,15 @@ def lines_of(
     ``paper`` has the paper's value for each line that is wanted: ``average``, ``maximum`` and
     ``jitter`` (maximum − minimum) in ms, ``late`` in cycles: those that took ``late_from_ns`` (of
     their column) or longer, which missed the slot that they were due in. Figures of undisturbed
-    cycles leave the late ones out, figures of all cycles leave out nothing.
+    cycles leave the late ones out, figures of all cycles leave out nothing. Beside a jitter stands
+    that at the receiver, where a run has it.
     """
-    found = {run.column: run for run in runs if run.name == name}
+    published = {run.column: run for run in runs if run.name == name}
+    received = {
+        column: replace(run, latency_ns=run.reception_ns)
+        for column, run in published.items()
+        if run.reception_ns is not None
+    }
     limits = late_from_ns if isinstance(late_from_ns, Mapping) else {}
     anywhere = late_from_ns if isinstance(late_from_ns, int) else np.inf
 
@@ -222,7 +235,7 @@ def lines_of(
         values: dict[str, Any] = dict.fromkeys(("simulated", "live"))
         intervals: dict[str, tuple[float, float]] = {}
         of_all = partial(figure, what)
-        for column, run in found.items():
+        for column, run in (received if what == AT_RECEIVER else published).items():
             limit = limits.get(column, anywhere)
             in_time = partial(figure, what, late_from_ns=limit)
             own, between = figures_of(run, in_time, in_time if what == "late" else of_all)
@@ -230,9 +243,18 @@ def lines_of(
             intervals |= between
         unit = "cycles" if what == "late" else "ms"
         values |= {"intervals": intervals, "no_evidence": no_evidence or {}}
+        values |= {"machines": machines_of(published.values())}
         return Line(f"{name}: {what}", unit, value, why=why, **values)
 
-    return [line(what, value) for what, value in paper.items()]
+    wanted = dict(paper)
+    if "jitter" in paper and received:
+        wanted[AT_RECEIVER] = None
+    return [line(what, value) for what, value in wanted.items()]
+
+
+def machines_of(runs: Iterable[Run]) -> dict[Column, str]:
+    """When and where the runs of each column were measured; nothing of what was simulated."""
+    return {run.column: run.measured for run in runs if run.column != "simulated"}
 
 
 def earlier_runs(name: str, *columns: Column, folder: Path = RESULTS) -> list[Run]:
@@ -240,56 +262,64 @@ def earlier_runs(name: str, *columns: Column, folder: Path = RESULTS) -> list[Ru
     path = folder / f"{name}.json"
     if not path.exists():
         return []
-    rows, found = pl.read_parquet(path.with_suffix(".parquet")), []
-    for run in json.loads(path.read_text())["runs"]:
-        if run["column"] in columns:
-            own = rows.filter(pl.col("column") == run["column"], pl.col("run") == run["name"])
-            latency, disturbed, block = (
-                own[key].to_numpy() for key in ("latency_ns", "disturbed", "block")
+    rows, runs = pl.read_parquet(path.with_suffix(".parquet")), []
+    for about in json.loads(path.read_text())["runs"]:
+        if about["column"] in columns:
+            cycles = rows.filter(
+                pl.col("column") == about["column"], pl.col("run") == about["name"]
             )
-            of_run = (run["repeats"], run["measured"])
-            found.append(Run(run["name"], run["column"], latency, disturbed, block, *of_run))
-    return found
+            latency, disturbed, block = (
+                cycles[key].to_numpy() for key in ("latency_ns", "disturbed", "block")
+            )
+            reception = cycles["reception_ns"]
+            run = Run(
+                *(about["name"], about["column"], latency, disturbed, block),
+                repeats=about["repeats"],
+                measured=about["measured"],
+                reception_ns=None if reception.null_count() else reception.to_numpy(),
+                facts=about["facts"],
+            )
+            runs.append(run)
+    return runs
 
 
-def earlier_lines(name: str, prefix: str, folder: Path = RESULTS) -> list[Line]:
-    """The lines of the last time that begin with ``prefix``, for what only a live run can make."""
-    path = folder / f"{name}.json"
-    lines = json.loads(path.read_text())["lines"] if path.exists() else []
-    known = {one.name for one in fields(Line)}
-    own = (line for line in lines if line["what"].startswith(prefix))
-    return [Line(**{key: value for key, value in line.items() if key in known}) for line in own]
+def lines_from(name: str, runs: Sequence[Run]) -> list[Line]:
+    """The lines of an experiment, computed from its runs."""
+    lines: list[Line] = import_module(name).lines(runs)
+    return lines
 
 
 def save(
     name: str,
     title: str,
-    lines: Sequence[Line],
+    lines: Callable[[Sequence[Run]], list[Line]],
     *,
-    runs: Sequence[Run] = (),
+    runs: Sequence[Run],
     pictures: Sequence[Path] = (),
     notes: str = "",
     folder: Path = RESULTS,
 ) -> Path:
-    """Print the lines, and write `NAME.json` and `NAME.parquet`; the path of the former.
+    """Print the lines of runs, and write `NAME.json` and `NAME.parquet`; the path of the former.
 
     ``pictures`` are files in :data:`PICTURES`, called `…_COLUMN.png`. ``notes`` (Markdown) stand
     below the table; without any, the earlier ones do.
     """
     folder.mkdir(exist_ok=True)
+    runs = [replace(run, measured=run.measured or _here_and_now(run)) for run in runs]
+    made = lines(runs)
     path, rows_path = folder / f"{name}.json", folder / f"{name}.parquet"
     earlier = json.loads(path.read_text()) if path.exists() else {}
     _write_beside(rows_path, _rows(runs).write_parquet)
     document = {
         "title": title,
         "notes": notes or earlier.get("notes", ""),
-        "lines": _lines(lines, runs, earlier.get("lines", [])),
+        "lines": [asdict(line) for line in made],
         "runs": [_summary(run) for run in runs],
         "pictures": _pictures(pictures, earlier.get("pictures", [])),
     }
     text = json.dumps(document, indent=1, ensure_ascii=False) + "\n"
     _write_beside(path, lambda beside: beside.write_text(text))
-    _print(document)
+    _print(title, made)
     return path
 
 
@@ -302,30 +332,41 @@ def value_text(value: Value) -> str:
     return f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}"
 
 
-def cell(line: Mapping[str, Any], column: str) -> str:
-    """One value of a line as it is printed, with its interval, and its mark where it has one."""
-    text = value_text(line[column])
-    interval = line["intervals"].get(column)
-    if interval is not None and line[column] is not None:
-        whole = line["unit"] == "cycles"
-        low, high = (value_text(round(limit) if whole else limit) for limit in interval)
-        text += f" ({low}–{high})"
-    marked = column.removesuffix("_all") in line["no_evidence"] and line[column] is not None
-    return f"{text} {MARK}" if marked else text
+def cell(line: Line, column: Column) -> str:
+    """The value of all cycles as it is printed, with its interval and its mark.
+
+    Behind it, where it is another one, that of undisturbed cycles in time.
+    """
+    calm, every = (getattr(line, key) for key in (column, f"{column}_all"))
+    if every is None:
+        every = calm
+    text = value_text(every)
+    interval = line.intervals.get(f"{column}_all")
+    if interval is not None and every is not None:
+        low, high = (round(end) if line.unit == "cycles" else end for end in interval)
+        text += f" ({value_text(low)}–{value_text(high)})"
+    if calm is not None and value_text(calm) != value_text(every):
+        text += f", calm {value_text(calm)}"
+    return f"{text} {MARK}" if column in line.no_evidence and every is not None else text
 
 
 def _rows(runs: Sequence[Run]) -> pl.DataFrame:
     """One row per cycle."""
     types: dict[str, type[pl.DataType]] = {
         **{"run": pl.String, "column": pl.String, "latency_ns": pl.Int64},
-        **{"disturbed": pl.Boolean, "block": pl.Int64},
+        **{"disturbed": pl.Boolean, "block": pl.Int64, "reception_ns": pl.Int64},
     }
     frames = [pl.DataFrame(schema=types)]
     for run in runs:
         rows = pl.DataFrame(
             {"latency_ns": run.latency_ns, "disturbed": run.disturbed, "block": run.blocks}
         )
-        named = rows.with_columns(run=pl.lit(run.name), column=pl.lit(run.column))
+        reception = pl.lit(None, pl.Int64)
+        if run.reception_ns is not None:
+            reception = pl.lit(pl.Series(run.reception_ns))
+        named = rows.with_columns(
+            run=pl.lit(run.name), column=pl.lit(run.column), reception_ns=reception
+        )
         frames.append(named.select(*types))
     return pl.concat(frames)
 
@@ -334,36 +375,14 @@ def _summary(run: Run) -> dict[str, Any]:
     return {
         "name": run.name,
         "column": run.column,
-        "measured": run.measured or _here_and_now(run.column != "simulated"),
+        "measured": run.measured,
         "cycles": int(run.latency_ns.size),
         "blocks": int(np.unique(run.blocks).size),
         "repeats": run.repeats,
         "incomplete": int((run.latency_ns < 0).sum()),
         "disturbed": int(run.disturbed.sum()),
+        "facts": dict(run.facts),
     }
-
-
-def _lines(
-    lines: Sequence[Line], runs: Sequence[Run], earlier: Sequence[dict[str, Any]]
-) -> list[dict[str, Any]]:
-    """The lines as they are written; a measured value that is of no run here is the earlier one."""
-    before = {line["what"]: line for line in earlier}
-    days = {run.name: run.measured or _here_and_now(True) for run in runs if run.column == "live"}
-    written = []
-    for line in lines:
-        values, name = asdict(line), line.what.rpartition(": ")[0]
-        if line.live is not None:
-            values["measured"] = line.measured or days.get(name)
-        known = before.get(line.what, {"live": None, "measured": None})
-        if line.live in (None, known["live"]) and values["measured"] is None:
-            values |= {key: known[key] for key in ("live", "measured")}
-        elif values["measured"] is None:
-            values["measured"] = _here_and_now(True)
-        for column in ROS:
-            if values[column] is None and line.what in before:
-                values[column] = before[line.what][column]
-        written.append(values)
-    return written
 
 
 def _pictures(pictures: Sequence[Path], earlier: Sequence[str]) -> list[str]:
@@ -373,9 +392,9 @@ def _pictures(pictures: Sequence[Path], earlier: Sequence[str]) -> list[str]:
     return sorted({*names, *measured})
 
 
-def _here_and_now(measured: bool) -> str:
-    """The day; for what is measured, also the kernel and the processors."""
-    if not measured:
+def _here_and_now(run: Run) -> str:
+    """The day; for a run that was measured, also the kernel and the processors."""
+    if run.column == "simulated":
         return f"{date.today()}"
     cpu = next(
         (
@@ -394,13 +413,11 @@ def _write_beside(path: Path, write: Callable[[Path], object]) -> None:
     beside.replace(path)
 
 
-def _print(document: Mapping[str, Any]) -> None:
-    table = Table(title=document["title"], title_justify="left")
-    table.add_column("")
-    lines = document["lines"]
-    there = [one for one in COLUMNS if any(line[one] is not None for line in lines)]
-    for column in ("unit", *(COLUMNS[one] for one in there)):
-        table.add_column(column, justify="right")
+def _print(title: str, lines: Sequence[Line]) -> None:
+    table = Table(title=title, title_justify="left")
+    for heading in ("", "unit", *COLUMNS.values()):
+        table.add_column(heading, justify="right" if heading else "left")
     for line in lines:
-        table.add_row(line["what"], line["unit"], *(cell(line, column) for column in there))
+        cells = (cell(line, column) for column in OURS)
+        table.add_row(line.what, line.unit, value_text(line.paper), *cells)
     Console(width=160).print(table)

@@ -23,7 +23,18 @@ from configurations import (
 )
 from numpy.typing import NDArray
 from on_ros import Shaping, ros_runs
-from results import MS, OURS, PICTURES, Line, Run, Value, earlier_runs, lines_of, save
+from results import (
+    MS,
+    OURS,
+    PICTURES,
+    Column,
+    Line,
+    Run,
+    Value,
+    earlier_runs,
+    lines_of,
+    save,
+)
 
 from chainshaper import load_application
 from chainshaper.planning import CallbackTimes, ChainPlan, PlanRequest, plan_shaping
@@ -46,6 +57,15 @@ WHY_LOAD = (
     "; the paper's grows with the load, which runs at a lower priority: here nothing of it reaches"
     " the chain but preemptions"
 )
+TAKEN_OVER: dict[Column, str] = dict.fromkeys(
+    ("simulated", "live"),
+    "simulated and live, the slots are the paper's: the last one opens at 64 ms, and the maximum"
+    " follows",
+)
+TAKEN_OVER_TOO: dict[Column, str] = {
+    "simulated": "simulated, the slots are the paper's, and the last callback's drawn times follow"
+    " its text: so does the jitter"
+}
 WHY_SERVERS = "64 ms, when the last slot opens, and the last callback's execution time"
 
 NOTES = (
@@ -112,8 +132,14 @@ def lines(runs: Sequence[Run]) -> list[Line]:
         made += lines_of(run_name("SCHED_FIFO", load), runs, figures, why=why)
     for load in INTERFERENCE_MS:
         figures = {"maximum": "≈ 80", "jitter": "≈ 10", "late": None}
-        name = run_name("five servers", load)
-        made += lines_of(name, runs, figures, late_from_ns=PERIOD_NS, why=WHY_SERVERS)
+        marks = {"maximum": TAKEN_OVER, "jitter": TAKEN_OVER_TOO}
+        for what, value in figures.items():
+            made += lines_of(
+                *(run_name("five servers", load), runs, {what: value}),
+                late_from_ns=PERIOD_NS,
+                why=WHY_SERVERS,
+                no_evidence=marks.get(what),
+            )
     return made
 
 
@@ -149,7 +175,7 @@ def main() -> None:
     save(
         "table_1",
         "Table 1: fixed priorities against time-driven servers, under interference",
-        lines(runs),
+        lines,
         runs=runs,
         pictures=pictures,
         notes=NOTES.format(

@@ -10,7 +10,7 @@ a high priority as in the first row.
 """
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,10 +25,10 @@ from configurations import (
     draw_latencies,
     live,
     live_in_turns,
-    output_of,
     parse_options,
     simulated,
 )
+from numpy.typing import NDArray
 from on_ros import Shaping, ros_runs
 from results import (
     HERE,
@@ -40,21 +40,21 @@ from results import (
     Line,
     Run,
     Value,
-    earlier_lines,
     earlier_runs,
     lines_of,
+    machines_of,
     save,
 )
-from table_4 import ROW_1, plans, slots_text
+from table_4 import FIFO, ROW_1, plans, slots_text
 
 from chainshaper import load_application
 from chainshaper.flow.plan import plan_recording
-from chainshaper.planning import ChainPlan, PlanRequest, load_plan, publish_slots
+from chainshaper.planning import ChainPlan, PlanRequest, publish_slots
 from chainshaper.simulation.simulating import with_recorded_times
 from chainshaper.values.errors import ChainshaperError
 from chainshaper.workload.description import Application
 
-__all__ = ["FIFO", "PERIOD_NS", "run_under_fifo"]
+__all__ = ["FIFO", "PERIOD_NS", "run_under_fifo", "widest_band"]
 
 PERIOD_NS = 100 * MS
 FIRST_SLOT_NS = 3 * MS
@@ -64,7 +64,6 @@ LIVE_MARGIN_NS = 3 * MS
 LIVE_MARGIN_OF_A_CALLBACK_NS = 1 * MS
 """A live profile is one drive of half a minute, and the next one has its own longest cycle."""
 
-FIFO = "SCHED_FIFO"
 RESAMPLED = "SCHED_FIFO, execution times from the live run"
 
 
@@ -82,7 +81,10 @@ class Row:
 
 
 WHY_LIVE = "live is another localizer on another machine: compare with its own first row"
-WHY_AGAIN = "the simulator delivers and takes clouds as fast as small messages"
+WHY_AGAIN = (
+    "the simulator delivers and takes clouds as fast as small messages, and has no other work: live"
+    " was measured while that filled the machine, and disturbed 271 of 275 cycles"
+)
 WHY_LATE = (
     "late are outputs of cycles in which something took longer than ever in the profile and its"
     " margin, and those behind them; " + WHY_LIVE
@@ -213,7 +215,7 @@ def run_simulated(cycles: int) -> tuple[list[Run], dict[str, ChainPlan]]:
     return runs, planned
 
 
-def resampled(options: Options) -> list[Line]:
+def resampled(options: Options) -> list[Run]:
     """The first row of what was measured live, beside its simulation with the recorded times.
 
     These are drawn in stretches of consecutive cycles, the same of all callbacks, so that what
@@ -222,53 +224,40 @@ def resampled(options: Options) -> list[Line]:
     measured, recording = run_under_fifo(options)
     described = with_recorded_times(real_application(), recording, block=20)
     again = simulated(RESAMPLED, described, cycles=options.simulated_cycles)
-    figures: dict[str, Value] = dict.fromkeys(("average", "maximum", "jitter"))
-    return lines_of(RESAMPLED, [again, replace(measured, name=RESAMPLED)], figures, why=WHY_AGAIN)
+    return [again, replace(measured, name=RESAMPLED)]
 
 
-def widest_band(run: Run, plan: ChainPlan) -> float:
-    """The largest jitter within a band (ms): of the latencies next to the same slot's start."""
-    latencies = run.undisturbed_ns[run.undisturbed_ns < PERIOD_NS]
-    starts = np.array([start for start, _ in publish_slots(plan)])
-    band = np.abs(latencies[:, None] - starts).argmin(axis=1)
-    widths = [np.ptp(latencies[band == one]) for one in np.unique(band)]
-    return float(max(widths)) / MS
+def widest_band(latency_ns: NDArray[np.int64], bands: int) -> float:
+    """The largest jitter within a band (ms) of outputs in their own cycle.
+
+    Bands are what the widest gaps between latencies keep apart.
+    """
+    in_time = np.sort(latency_ns[latency_ns < PERIOD_NS])
+    gaps = np.sort(np.argsort(np.diff(in_time))[-(bands - 1) :])
+    return float(max(np.ptp(band) for band in np.split(in_time, gaps + 1))) / MS
 
 
-def ros_plans(keep: Path, column: Column) -> dict[str, ChainPlan]:
-    """What the command planned on ROS 2; nothing where it was not measured now."""
-    paths = {name: output_of(keep / column, name) / "plan.yaml" for name in ROWS}
-    return {name: load_plan(path).chains[0] for name, path in paths.items() if path.exists()}
-
-
-def lines(runs: Sequence[Run], plans_of: Mapping[Column, Mapping[str, ChainPlan]]) -> list[Line]:
+def lines(runs: Sequence[Run]) -> list[Line]:
     """Average, maximum and jitter of every row; what was late; what a band's jitter is."""
     paper: dict[str, Value] = {"average": 67.4, "maximum": 84.7, "jitter": 51.8}
     made = lines_of(FIFO, runs, paper, why=WHY_LIVE, no_evidence=FITTED)
     for name, row in ROWS.items():
-        drawn = plans_of["simulated"][name]
-        banded = publish_slots(drawn) if drawn.shaping_node else ()
         paper = {"average": row.average, "maximum": row.maximum, "late": None}
         marks = ELSEWHERE if "random" in name else FITTED
-        if len(banded) <= 1 or row.spread is not None:
+        bands = row.request.bands if isinstance(row.request.bands, int) else 1
+        if bands == 1 or row.spread is not None:
             paper["jitter"] = row.spread or row.jitter
         made += lines_of(name, runs, paper, late_from_ns=PERIOD_NS, why=row.why, no_evidence=marks)
-        if len(banded) > 1:
-            widths: dict[str, Any] = {"simulated": None, "live": None} | {
-                run.column: widest_band(run, plans_of[run.column][name])
-                for run in runs
-                if run.name == name and name in plans_of.get(run.column, {})
+        if bands > 1:
+            banded = [run for run in runs if run.name == name]
+            widths: dict[str, Any] = {
+                run.column: widest_band(run.undisturbed_ns, bands) for run in banded
             }
+            values = {"simulated": None, "live": None, "machines": machines_of(banded)} | widths
             what = f"{name}: jitter within a band"
-            made.append(Line(what, "ms", row.jitter, why=row.why, **widths))
-    return made
-
-
-def slots_of_row_1(live_plans: dict[str, ChainPlan]) -> Line:
-    """The live slots of the schedule whose plan needs more than latencies; for table 4."""
-    plan = live_plans.get(ROW_1)
-    text = None if plan is None else slots_text(plan)
-    return Line(f"{ROW_1}: slots", "ms", None, None, text, "planned from the live callbacks' times")
+            made.append(Line(what, "ms", row.jitter, why=row.why, **values))
+    figures: dict[str, Value] = dict.fromkeys(("average", "maximum", "jitter"))
+    return made + lines_of(RESAMPLED, runs, figures, why=WHY_AGAIN)
 
 
 def picture(runs: Sequence[Run], planned: dict[str, ChainPlan], name: str) -> Path:
@@ -305,32 +294,26 @@ def main() -> None:
         options = parse_options(__doc__, cycles=280, until=until)
         runs, drawn_plans = run_simulated(options.simulated_cycles)
         pictures = [picture(runs, drawn_plans, "figure_6_simulated.png")]
-        live_plans: dict[str, ChainPlan] = {}
-        notes, again = "", list[Line]()
+        notes = ""
         if options.live:
             real, live_plans, failed = run_live(options)
             pictures.append(picture(real, live_plans, "figure_6_live.png"))
             notes = notes_of(options.keep, failed)
-            runs += real
-            again = resampled(options)
+            slots = {name: {"slots": slots_text(plan)} for name, plan in live_plans.items()}
+            runs += [replace(run, facts=slots.get(run.name, {})) for run in real]
+            runs += resampled(options)
         else:
             runs += earlier_runs("table_3", "live")
-            again = earlier_lines("table_3", RESAMPLED)
+            runs += [run for run in earlier_runs("table_3", "simulated") if run.name == RESAMPLED]
         on_ros = ros_runs("table_3", shapings(), options)
         for column in ROS:
             if own := [run for run in on_ros if run.column == column]:
                 pictures.append(picture(own, {}, f"figure_6_{column}.png"))
-        runs += on_ros
-        plans_of: dict[Column, dict[str, ChainPlan]] = {
-            "simulated": drawn_plans,
-            "live": live_plans,
-        }
-        plans_of |= {column: ros_plans(options.keep, column) for column in ROS}
         save(
             "table_3",
             "Table 3 and figure 6: valet parking under six schedules",
-            [*lines(runs, plans_of), *again, slots_of_row_1(live_plans)],
-            runs=runs,
+            lines,
+            runs=[*runs, *on_ros],
             pictures=pictures,
             notes=notes,
         )

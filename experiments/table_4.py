@@ -1,25 +1,22 @@
 """Table 4: the slots of every schedule of valet parking, and the averages of table 3.
 
-    python experiments/table_4.py [--measured results/table_3.parquet]
+    python experiments/table_4.py
 
 Slots are in ms, boundaries on whole ms as in the paper. Simulated are those of a latency sample
 that is calibrated on table 3 (:mod:`avp_sample`), live those of the latencies that table 3 has
-measured of the localisation that really computes; nothing is run here. Averages and maxima are
-predicted with outputs at the start of their slots (eq. 5); the paper's came 0.6 ms after it.
-Slots are half-open here: the paper's [86, 87] is [86, 87).
+measured of the localisation that really computes; nothing is run here. Averages are those of
+eq. 5, with every output at the start of its slot instead of the end, where it leaves; the paper's
+came 0.6 ms after it. Slots are half-open here: the paper's [86, 87] is [86, 87).
 """
 
 import argparse
-import json
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import polars as pl
 from avp_sample import MS, ORIGIN, PERIOD_NS, avp_sample
 from numpy.typing import NDArray
-from results import RESULTS, Column, Line, Value, save
+from results import Column, Line, Run, Value, earlier_runs, figure, machines_of, save
 
 from chainshaper.planning import CallbackTimes, ChainPlan, plan_shaping
 from chainshaper.planning.bands import with_bands, with_long_slot
@@ -29,7 +26,18 @@ from chainshaper.planning.shaping import (
     with_first_node_apart,
 )
 
-__all__ = ["MARGIN_NS", "MWCETS_US", "parse_measured", "plans"]
+__all__ = [
+    "FIFO",
+    "MARGIN_NS",
+    "MWCETS_US",
+    "latencies_by_column",
+    "parse_only_simulated",
+    "planned_from",
+    "plans",
+]
+
+FIFO = "SCHED_FIFO"
+SAMPLE = "calibrated sample"
 
 NODES = ("/throttler", "/rear_filter", "/fusion", "/voxel_grid", "/localizer")
 
@@ -114,77 +122,73 @@ def slots_text(plan: ChainPlan) -> str:
 
 
 def average(plan: ChainPlan) -> Value:
-    """The predicted average (ms), for outputs at the start of their slots."""
+    """The predicted average (ms), for outputs at the start of their slots.
+
+    In a long slot, and without one, outputs leave as they come.
+    """
     if plan.policy == "server-per-callback":
         return None
     early = MS if plan.policy == "shaped" else 0
     return (plan.predicted.mean_ns - early) / MS
 
 
-def measured_latencies(path: Path) -> NDArray[np.int64] | None:
-    """The live latencies under SCHED_FIFO that table 3 has kept; None where it never ran live."""
-    if not path.exists():
-        return None
-    rows = pl.read_parquet(path).filter(
-        pl.col("column") == "live",
-        pl.col("run") == "SCHED_FIFO",
-        ~pl.col("disturbed"),
-        pl.col("latency_ns") >= 0,
-    )
-    return rows["latency_ns"].to_numpy() if rows.height else None
+def planned_from(of_table_3: Sequence[Run]) -> list[Run]:
+    """What table 4 and figure 7 are planned from: the sample, and table 3's latencies, if any.
 
-
-def row_1(folder: Path = RESULTS) -> dict[str, Any]:
-    """Of the first row what table 3 has: the live slots, both averages (ms), and the day."""
-    path = folder / "table_3.json"
-    lines = json.loads(path.read_text())["lines"] if path.exists() else []
-    found = {line["what"]: line for line in lines if line["what"].startswith(f"{ROW_1}: ")}
-    slots, mean = (found.get(f"{ROW_1}: {what}", {}) for what in ("slots", "average"))
-    return {
-        "slots": slots.get("live"),
-        "simulated": mean.get("simulated"),
-        "live": mean.get("live"),
-        "measured": mean.get("measured"),
-    }
-
-
-def parse_measured(about: str) -> NDArray[np.int64] | None:
-    """The command line of what is planned from table 3's latencies; those, where there are any.
-
-    None as well where the longest does not fit into a cycle, which no plan can help.
+    These are left out where the longest does not fit into a cycle, which no plan can help.
     """
-    parser = argparse.ArgumentParser(description=about.partition("\n")[0])
-    parser.add_argument("--simulated", action="store_true", help="nothing is run live here anyway")
-    parser.add_argument("--measured", type=Path, default=RESULTS / "table_3.parquet")
-    measured = measured_latencies(parser.parse_args().measured)
-    if measured is not None and measured.max() > PERIOD_NS - 3 * MS:
-        print(f"not planned: table 3's live chain took up to {measured.max() / MS:.1f} ms")
-        return None
-    return measured
+    sample = avp_sample()
+    runs = [Run(SAMPLE, "simulated", sample, np.zeros(sample.size, np.bool_))]
+    for run in of_table_3:
+        if run.name == FIFO and run.undisturbed_ns.max() <= PERIOD_NS - 3 * MS:
+            runs.append(run)
+    return runs
+
+
+def latencies_by_column(runs: Sequence[Run]) -> dict[Column, NDArray[np.int64]]:
+    """The latencies that a column is planned from."""
+    return {run.column: run.undisturbed_ns for run in runs if run.name in (SAMPLE, FIFO)}
+
+
+def lines(runs: Sequence[Run]) -> list[Line]:
+    """Slots and average of each row; of the first, both are table 3's live, the average is always.
+
+    The servers of the first follow from table 2, not from latencies.
+    """
+    planned = {column: plans(found) for column, found in latencies_by_column(runs).items()}
+    row_1 = {run.column: run for run in runs if run.name == ROW_1}
+    made = []
+    for row, (slots, mean) in PAPER_ROWS.items():
+        texts: dict[str, Any] = {"simulated": None, "live": None}
+        means: dict[str, Any] = {"simulated": None, "live": None}
+        for column, plans_of in planned.items():
+            texts[column], means[column] = slots_text(plans_of[row]), average(plans_of[row])
+        if row == ROW_1:
+            texts["live"] = row_1["live"].facts.get("slots") if "live" in row_1 else None
+            means |= {
+                column: figure("average", run.undisturbed_ns) for column, run in row_1.items()
+            }
+        about: dict[str, Any] = {"why": WHY.get(row, ""), "machines": machines_of(runs)}
+        about["no_evidence"] = OF_TABLE_2 if row == ROW_1 else FITTED
+        made.append(Line(f"{row}: slots", "ms", slots, **texts, **about))
+        made.append(Line(f"{row}: average", "ms", mean, **means, **about))
+    return made
 
 
 def main() -> None:
-    measured = parse_measured(__doc__)
-    calibrated = plans(avp_sample())
-    # Slots per callback follow from table 2, not from latencies.
-    live = {} if measured is None else plans(measured)
-    live.pop(ROW_1, None)
-    lines, day = [], row_1().get("measured")
-    for row, (slots, mean) in PAPER_ROWS.items():
-        plan, real, marks = calibrated[row], live.get(row), FITTED
-        real_slots: Value = None if real is None else slots_text(real)
-        our_mean, real_mean = average(plan), None if real is None else average(real)
-        if row == ROW_1:
-            marks, of_table_3 = OF_TABLE_2, row_1()
-            real_slots, our_mean, real_mean = map(of_table_3.get, ("slots", "simulated", "live"))
-        why = WHY.get(row, "")
-        for what, paper, ours, theirs in (
-            ("slots", slots, slots_text(plan), real_slots),
-            ("average", mean, our_mean, real_mean),
-        ):
-            own = Line(f"{row}: {what}", "ms", paper, ours, theirs, why, no_evidence=marks)
-            lines.append(replace(own, measured=None if theirs is None else day))
-    save("table_4", "Table 4: slots of valet parking", lines, notes=ORIGIN.replace("\n", " "))
+    parse_only_simulated(__doc__)
+    of_table_3 = earlier_runs("table_3", "simulated", "live")
+    measured = [run for run in of_table_3 if run.column == "live"]
+    runs = [*planned_from(measured), *(run for run in of_table_3 if run.name == ROW_1)]
+    notes = ORIGIN.replace("\n", " ")
+    save("table_4", "Table 4: slots of valet parking", lines, runs=runs, notes=notes)
+
+
+def parse_only_simulated(about: str) -> None:
+    """Parse the command line of an experiment that measures nothing."""
+    parser = argparse.ArgumentParser(description=about.partition("\n")[0])
+    parser.add_argument("--simulated", action="store_true", help="nothing is run live here anyway")
+    parser.parse_args()
 
 
 if __name__ == "__main__":

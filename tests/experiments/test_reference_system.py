@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import reference_system
 import results
-from reference_system import Block, Configuration, limit_for, notes, runs_and_lines
+from reference_system import Block, Configuration, limit_for, lines, notes, runs_of
 from results import MS, Run
 
 
@@ -40,13 +40,13 @@ def test_the_notes_have_all_configurations_and_say_whether_the_goal_is_met(
     *others, shaped = reference_system.CONFIGURATIONS
     found = {one.name: ([a_block(one, 15, 20, 18)] * 2, 0) for one in others}
     found[shaped.name] = ([a_block(shaped, 20.3, 20.31, 20.32)] * 2, 0)
-    runs, lines = runs_and_lines(found)
+    runs = runs_of(found)
     assert len(runs) == 18 and all(run.blocks.max() == 1 for run in runs)
-    text = notes(lines, found[shaped.name][0], 30)
+    text = notes(lines(runs), found[shaped.name][0], 30)
     assert "| single-threaded | 20.0 | 5.00" in text
     assert "of the single blocks: 0.02, 0.02 ms" in text
     assert "p0.5–p99.5 0.02 ms, goal 0.1 ms: met; no more drops" in text
     assert "maximum 101.6% of the best other's, goal 102%: met" in text
     found[shaped.name] = ([a_block(shaped, 21, 20, -1e-6, drops=1)], 0)
-    again = notes(runs_and_lines(found)[1], found[shaped.name][0], 30)
+    again = notes(lines(runs_of(found)), found[shaped.name][0], 30)
     assert again.count("**not met**") == 3
