@@ -33,6 +33,18 @@ def test_names_that_do_not_exist_are_said_not_to() -> None:
         _ = chainshaper.shape_it
 
 
+def test_names_are_listed_before_they_are_imported() -> None:
+    program = "import chainshaper, sys; print(*dir(chainshaper))"
+    run = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    listed = run.stdout.split()
+    assert {"plan_recording", "measure_latency", "Recording", "__doc__"} <= {*listed}
+    assert {*chainshaper.__all__} <= {*listed}
+    assert listed == sorted(listed)
+    assert _modules_after("import chainshaper; dir(chainshaper)").isdisjoint(HEAVY)
+
+
 def test_importing_the_package_loads_nothing_heavy() -> None:
     assert _modules_after("import chainshaper").isdisjoint(HEAVY)
 

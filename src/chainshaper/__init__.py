@@ -65,8 +65,10 @@ if TYPE_CHECKING:
     from chainshaper.planning import plan_shaping as plan_shaping
     from chainshaper.planning import save_plan as save_plan
     from chainshaper.reporting.figures import draw_distribution as draw_distribution
+    from chainshaper.reporting.figures import draw_hops as draw_hops
     from chainshaper.reporting.figures import draw_latency as draw_latency
     from chainshaper.reporting.graph_drawing import write_picture as write_picture
+    from chainshaper.reporting.notebook import html_of as html_of
     from chainshaper.reporting.page import write_report as write_report
     from chainshaper.reporting.perfetto import export_mcap as export_mcap
     from chainshaper.reporting.perfetto import export_perfetto as export_perfetto
@@ -89,6 +91,7 @@ if TYPE_CHECKING:
     from chainshaper.verify.measure import Measurement as Measurement
     from chainshaper.verify.measure import compare_chains as compare_chains
     from chainshaper.verify.measure import compare_recordings as compare_recordings
+    from chainshaper.verify.measure import cycle_parts as cycle_parts
     from chainshaper.verify.measure import hop_breakdown as hop_breakdown
     from chainshaper.verify.measure import measure_latency as measure_latency
     from chainshaper.workload.description import Application as Application
@@ -117,3 +120,8 @@ def __getattr__(name: str) -> Any:
     if home is None:
         raise AttributeError(f"module 'chainshaper' has no attribute {name!r}")
     return getattr(import_module(home), name)
+
+
+def __dir__() -> list[str]:
+    """List the public names, for `dir` and completion, although they are not imported yet."""
+    return sorted({*globals(), *_homes()} - {"annotations", "cache"})

@@ -222,7 +222,10 @@ def test_without_a_chain_those_of_the_trace_are_proposed() -> None:
 def test_wrong_use_ends_with_2_and_a_hint(command: str) -> None:
     finished = called(*command.split())
     assert (finished.code, finished.out) == (2, "")
-    assert "Usage: chainshaper" in finished.err
+    (line,) = finished.err.splitlines()
+    assert line.startswith("error: "), "in the style of all other errors"
+    assert "see `chainshaper" in line
+    assert line.endswith("--help`")
     assert "Traceback" not in finished.err
 
 

@@ -202,7 +202,9 @@ def test_a_promise_is_judged_in_one_line_and_an_exit_code(tmp_path: Path) -> Non
     application = Path(__file__).parents[2] / "examples" / "synthetic_chain.yaml"
     before, after, plan = tmp_path / "before", tmp_path / "after", tmp_path / "plan.yaml"
     assert called("simulate", application, "-o", before).code == 0
-    printed = called("plan", before, "-o", plan).out
+    planned = called("plan", before, "-o", plan)
+    assert planned.code == 0, planned.err
+    printed = planned.out
     assert "outputs leave at" in printed
     assert "expected jitter 0.1" in printed
     assert called("simulate", application, plan, "-o", after).code == 0
@@ -213,7 +215,7 @@ def test_a_promise_is_judged_in_one_line_and_an_exit_code(tmp_path: Path) -> Non
     broken = called("compare", after, before, "--plan", plan, "--strict")
     assert broken.code == 1
     assert "before: promise broken: jitter" in broken.out.splitlines()[-1]
-    assert broken.err == "error: the plan's promise is not met (--strict)\n"
+    assert broken.err.splitlines()[-1] == "error: the plan's promise is not met (--strict)"
     assert "name the plan in force" in called("compare", before, before, "--strict").err
     assert json_of("compare", before, after)["recordings"][1]["prediction"]["kept"] is True
     assert json_of("plan", before)["expected"]["jitter_ns"] == 100_000

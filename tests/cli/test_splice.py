@@ -33,7 +33,8 @@ def test_it_shows_what_is_redirected_and_what_to_launch(files: Files) -> None:
     copy = f"{folder}/robot.launch.py"
     finished = called("splice", plan, robot, "n:=1 2", "-o", folder)
     assert finished.code == 0
-    sample, kind = finished.err.splitlines()
+    # On a slow machine a line says what it is doing, too.
+    sample, kind = [line for line in finished.err.splitlines() if line.startswith("note: ")]
     assert sample.startswith("note: the sample is small: 2 cycles"), "before the plan is used"
     assert kind.startswith("note: /t3: the shaping node is in Python; it needs no building")
     assert finished.out.splitlines() == [

@@ -18,7 +18,7 @@ from matplotlib import image
 from chainshaper import measure_latency, write_report
 from chainshaper.values.durations import milliseconds
 
-CHARTS = ("over-time", "histogram", "cdf", "breakdown", "timeline", "slots-0")
+CHARTS = ("over-time", "histogram", "cdf", "breakdown", "stacked", "timeline", "slots-0")
 
 
 @pytest.fixture(scope="module")
@@ -222,3 +222,51 @@ def test_no_column_is_cut_off(page: Page, width: int) -> None:
     )
     page.look(1280, 900)
     assert cut == ""
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+def test_no_heading_breaks_inside_a_word(page: Page, width: int) -> None:
+    page.look(width, 900)
+    broken = page.run(
+        "[...document.querySelectorAll('main thead th')].flatMap((head) => {"
+        " const text = document.createTreeWalker(head, NodeFilter.SHOW_TEXT), broken = [];"
+        " while (text.nextNode()) for (const {index, 0: word} of"
+        " text.currentNode.data.matchAll(/\\S+/g)) { const range = document.createRange();"
+        " range.setStart(text.currentNode, index);"
+        " range.setEnd(text.currentNode, index + word.length);"
+        " if (range.getClientRects().length > 1) broken.push(word); } return broken; })"
+    )
+    page.look(1280, 900)
+    assert broken == []
+
+
+def test_hops_are_named_by_their_nodes_where_the_time_goes(page: Page) -> None:
+    labels = "[...document.querySelectorAll('#breakdown svg .label')].map((one) => "
+    labels += "one.firstChild.data)"
+    named = page.run(labels)
+    assert named[:3] == ["before: /first, 4.000 ms", "before: /second, 11.000 ms", named[2]]
+    assert named[2].startswith("before: /chainshaper_t2, 15.020 ms")
+    assert len(named) == 6
+
+
+def test_the_stacked_parts_of_a_cycle_are_told_and_open_it_below(page: Page) -> None:
+    page.run("document.querySelector('#stacked .chart').focus()")
+    for _ in range(2):
+        page.press("ArrowRight")
+    told = page.run("document.getElementById('tip').innerText")
+    assert told.splitlines()[0] == "cycle 1: 30.020 ms"
+    assert told.splitlines()[2:] == [
+        "/second: communication 1.000, computation 10.000",
+        "/chainshaper_t2: communication 1.000, waiting 14.020",
+    ]
+    page.press("Enter")
+    about = page.run("document.querySelector('#timeline .about').innerText")
+    assert about.startswith("Cycle 1: 30.020 ms")
+
+
+def test_the_graphs_of_a_report_leave_its_own_texts_alone(page: Page) -> None:
+    """Their rules and ids would hold for the whole page."""
+    assert page.run("document.querySelectorAll('svg.graph').length") == 2
+    assert page.run("document.getElementById('tip').tagName") == "DIV"
+    family = "getComputedStyle(document.querySelector('#over-time svg text')).fontFamily"
+    assert "system-ui" in page.run(family)

@@ -23,6 +23,9 @@ from chainshaper.analysis.outputs_due import not_begun, with_outputs_due
 from chainshaper.analysis.traversals import reception, traverse
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Chain, trigger_text
+from chainshaper.values.durations import milliseconds
+from chainshaper.values.errors import shown
+from chainshaper.values.notebook import notebook_html
 from chainshaper.values.recording import Recording
 
 PERCENTILES: tuple[float, ...] = (0.5, 1, 5, 25, 50, 75, 95, 99, 99.5)
@@ -42,6 +45,18 @@ class LatencyStatistics:
     spread_ns: int | None  # p99.5 − p0.5
     percentiles_ns: dict[str, int]  # by `PERCENTILES` as text; linear between the nearest values
     late: int | None = None  # how many of `count` left behind their slot or cycle; None: not known
+
+    @property
+    def text(self) -> str:
+        """The most important figures in a line."""
+        if self.mean_ns is None or self.max_ns is None or self.jitter_ns is None:
+            return f"no complete cycle, {self.incomplete} incomplete"
+        figures = ("average", self.mean_ns), ("maximum", self.max_ns), ("jitter", self.jitter_ns)
+        parts = [f"{self.count} cycles"]
+        parts += [f"{name} {milliseconds(time_ns)} ms" for name, time_ns in figures]
+        parts += [f"{self.disturbed} disturbed"] if self.disturbed else []
+        parts += [f"{self.incomplete} incomplete"] if self.incomplete else []
+        return ", ".join(parts)
 
 
 def latency_statistics(
@@ -242,6 +257,11 @@ class LatencyAnalysis:
     notes: tuple[str, ...]
     not_begun: int = 0  # cycles of a plan in which the first callback did not run
     period_ns: int | None = None  # of the timer that starts the chain; None: no timer does
+
+    def __repr__(self) -> str:
+        return shown(f"LatencyAnalysis({self.chain.spec}: {self.statistics.text})")
+
+    _repr_html_ = notebook_html
 
     @property
     def decided(self) -> pl.DataFrame:

@@ -20,7 +20,7 @@ from typing import Any, NoReturn
 __all__ = ["main"]
 
 REMEDY = "raise the limit (`ulimit -v`), free memory, or give a smaller input"
-OF_ANALYSIS = ("matplotlib",)
+OF_ANALYSIS = ("matplotlib", "resvg_py")
 """The packages of the extra `analysis`, which robots do not have."""
 _LACK_OF_MEMORY = (
     "cannot allocate memory",
@@ -48,6 +48,8 @@ _PLAIN = {
     "μ": "u",
     "×": "x",
     "≤": "<=",
+    "✓": "+",
+    "✗": "x",
 }
 _LEAST_FOR_TABLES = 400_000_000
 """Bytes of address space below which Polars, as it loads, hangs or dies where it should say so."""
@@ -71,7 +73,7 @@ def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
 def _run(arguments: list[str] | None, name: str) -> None:
     """As :func:`main`, but signals go on raising KeyboardInterrupt where they do so here."""
     from chainshaper.cli.output import say
-    from chainshaper.values.errors import ChainshaperError, shown
+    from chainshaper.values.errors import ChainshaperError
 
     _prepare_output_and_memory()
     _interrupted.clear()
@@ -95,9 +97,7 @@ def _run(arguments: list[str] | None, name: str) -> None:
         try:
             sys.exit(app(arguments, prog_name=name, standalone_mode=False))
         except USAGE_ERROR as error:
-            error.message = shown(error.message, but="\n")  # it may quote a file's name
-            error.show()
-            sys.exit(error.exit_code)
+            fail(_misuse_text(error, words, name), error.exit_code)
         except Abort:  # a question without an answer
             say("Aborted.")
             sys.exit(1)
@@ -125,6 +125,16 @@ def _run(arguments: list[str] | None, name: str) -> None:
         if message is None:
             raise
         fail(message, 1)
+
+
+def _misuse_text(error: Any, words: list[str], name: str) -> str:
+    """Say what is wrong with a command line, in the style of our own errors."""
+    if not words:
+        error.show()  # the help
+        sys.exit(error.exit_code)
+    help_of = name if error.ctx is None else error.ctx.command_path
+    message = error.format_message().rstrip(".")
+    return f"{message[:1].lower()}{message[1:]}: see `{help_of} --help`"
 
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

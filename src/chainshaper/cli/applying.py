@@ -39,10 +39,14 @@ def threads(
 
     pid = int(where) if where is not None and where.isdecimal() else None
     plan = None if where is None or pid is not None else cs.load_plan(where)
-    known = opt.recording_of(recording)
-    running = cs.find_threads(plan if pid is None else pid, known, users=user or ())
+    with out.late_progress("threads") as report:
+        report(0.0, "looking for nodes and their threads")
+        known = opt.recording_of(recording)
+        running = cs.find_threads(plan if pid is None else pid, known, users=user or ())
     if out.present(json, threads_json(running), threads_table(running)):
         out.notes(running.notes)
+        if plan is not None:
+            out.next_step("chainshaper", "apply", str(where), "--dry-run")
 
 
 def apply(
@@ -60,11 +64,13 @@ def apply(
         "--phase DURATION",
         "Where in a cycle the chain's timer expires, on CLOCK_MONOTONIC: slots then stay there."
         " Default: measured, and followed where it drifts.",
+        rich_help_panel=opt.IN_FORCE,
     ),
     recording: Path | None = opt.option(
         "--recording REC",
         "Of these very processes, or of an earlier run: it tells which threads execute what. "
         "Default: the plan's own, where it exists.",
+        rich_help_panel=opt.THREADS,
     ),
     wait: int | None = opt.option(
         "--wait DURATION",
@@ -89,15 +95,18 @@ def apply(
     opt.refuse_bound_alone(max_latency, adapt)
     known = opt.recording_of(recording)
     if dry_run:
-        changes = cs.planned_changes(
-            planned, backend, recording=known, phase_ns=phase, users=user or ()
-        )
+        with out.late_progress("apply") as report:
+            report(0.0, "looking for nodes and their threads")
+            changes = cs.planned_changes(
+                planned, backend, recording=known, phase_ns=phase, users=user or ()
+            )
         if out.present(json, asdict(changes)):
             for words in changes.commands:
                 out.show_line(shlex.join(words))
             if not changes.commands:
                 out.show(changes_table(changes.threads))
             out.notes((f"back end {changes.back_end}: {changes.reason}", *changes.notes))
+            out.next_step("chainshaper", "apply", plan)
         return
     out.warn(planned)
     with out.stop_on_signals() as stop, _watching() as (watch, report):
@@ -182,6 +191,7 @@ def status(
     if runs:
         states = (state for _, state in runs if state is not None)
         out.show(runs_table(runs), *map(servers_table, states))
+        out.next_step("chainshaper", "release", runs[0][0].name)
     elif not strays:
         out.show_line("no plan is in force")
     out.notes(line for journal, _ in runs for line in strange_lines(journal))
@@ -254,9 +264,12 @@ def doctor(
     json: bool = opt.JSON,
 ) -> None:
     """Examine this machine: scheduling, privileges, tracing, DDS, and its own stalls."""
-    from chainshaper.reporting.overviews import machine_json, machine_tables
+    from chainshaper.reporting.overviews import machine_json, machine_line, machine_tables
 
-    with out.progress("examining this machine") as report:
-        report(0.0, "watching for stalls")
+    with (
+        out.progress("examining this machine") as report,
+        out.lasting(report, watch / 1e9, "watching for stalls"),
+    ):
         machine = cs.examine_machine(watch)
-    out.present(json, machine_json(machine), *machine_tables(machine))
+    if out.present(json, machine_json(machine), *machine_tables(machine)):
+        out.show_line(machine_line(machine))

@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 
 Source: TypeAlias = Literal["lttng", "preload", "ebpf"]
 
+# Panels of the help, behind that of the common options.
+EVIDENCE, TRACING, THREADS = "What is planned from", "Tracing", "Which threads"
+IN_FORCE, NODE_PANEL = "While the plan is in force", "The shaping node"
+
 DESCRIPTIONS = (".yaml", ".yml")  # what applications' and plans' files end with
 
 
@@ -137,9 +141,16 @@ TRACE: list[Path] = argument(
 APPLICATION: Path = argument("APP.yaml", "The application's description.", ...)
 RECORDING_OUTPUT: Path = option("--output -o REC", "Folder to write; must not exist.", ...)
 SINCE: int = option(
-    "--skip --from DURATION", "Leave out what the recording begins with, such as 2s of start-up.", 0
+    "--skip --from DURATION",
+    "Leave out what the recording begins with, such as 2s of start-up.",
+    0,
+    rich_help_panel=EVIDENCE,
 )
-UNTIL: int | None = option("--to DURATION", "Leave out what happened this long after it began.")
+UNTIL: int | None = option(
+    "--to DURATION",
+    "Leave out what happened this long after it began.",
+    rich_help_panel=EVIDENCE,
+)
 CYCLES: int = option("--cycles", "Cycles to record.", 320, min=1)
 SEED: int | None = option("--seed", "Random seed; overrides the file's.", min=0)
 REALTIME: bool | None = option(
@@ -155,12 +166,17 @@ ADAPT: bool = option(
     "Slots follow the latencies: later when the plan's promise does not hold any more, earlier when"
     " latency can be given back.",
     False,
+    rich_help_panel=IN_FORCE,
 )
 MAX_LATENCY: int | None = option(
-    "--max-latency DURATION", "With --adapt: no slot ends later. Default: as the plan says."
+    "--max-latency DURATION",
+    "With --adapt: no slot ends later. Default: as the plan says.",
+    rich_help_panel=IN_FORCE,
 )
 SOURCE: Source | None = option(
-    "--source", "Tracer. Default: preload, or lttng where that cannot be had."
+    "--source",
+    "Tracer. Default: preload, or lttng where that cannot be had.",
+    rich_help_panel=TRACING,
 )
 NODE: NodeChoice = option(
     "--node auto|python|cpp",
@@ -168,6 +184,7 @@ NODE: NodeChoice = option(
     " and can be. What kind of node in C++, for all types or for the output's own, in a process or"
     " in the publisher's container, is found out.",
     "auto",
+    rich_help_panel=NODE_PANEL,
 )
 
 
@@ -188,8 +205,8 @@ def wish(name: str, **more: Any) -> Any:
     if described.least is not None:
         more["min"] = described.least
     default = more.pop("default", _WISHES[name].default)
-    panel = described.panel
-    return option(f"{names} {metavar}", described.help, default, rich_help_panel=panel, **more)
+    more.setdefault("rich_help_panel", described.panel)
+    return option(f"{names} {metavar}", described.help, default, **more)
 
 
 MODE_PROFILE: list[str] | None = option(

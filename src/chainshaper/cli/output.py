@@ -2,9 +2,11 @@
 
 import json
 import os
+import shlex
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 
+SPEAK_EVERY_S = 10.0  # about a stage, where there is no bar
 PATIENCE_S = 2.0  # work that takes longer than this shows its progress
 
 
@@ -80,6 +83,11 @@ def notes(lines: Iterable[str]) -> None:
         say(f"note: {line}")
 
 
+def next_step(*words: str | Path) -> None:
+    """Say on stderr which command a user mostly wants behind this one."""
+    say(f"next: {shlex.join(map(str, words))}")
+
+
 def warn(plan: "cs.Plan") -> None:
     """Say what is doubtful about a plan, before it is used."""
     from chainshaper.planning import plan_warnings
@@ -94,9 +102,10 @@ def progress(title: str) -> Iterator[Progress]:
         yield stage_lines(title)
         return
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
     columns = (
+        SpinnerColumn(),  # it also turns where the share of what is done stays the same for long
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         TextColumn("{task.percentage:>3.0f}%"),
@@ -138,16 +147,43 @@ def late_progress(title: str) -> Iterator[Progress]:
 
 
 def stage_lines(title: str) -> Progress:
-    """Show progress as one line per stage, where a bar would disturb what others print."""
-    last = ""
+    """Show progress as one line per stage, where a bar would disturb what others print.
 
-    def report(_: float, stage: str) -> None:
-        nonlocal last
+    A stage that takes long has a line with percent and time left every ten seconds.
+    """
+    last, began, spoke = "", 0.0, 0.0
+
+    def report(share: float, stage: str) -> None:
+        nonlocal last, began, spoke
+        now = time.monotonic()
         if stage != last:
             say(f"{title}: {stage}")
-            last = stage
+            last, began, spoke = stage, now, now
+        elif now - spoke >= SPEAK_EVERY_S and 0 < share < 1:
+            left_s = (now - began) / share * (1 - share)
+            say(f"{title}: {share:.0%}, about {left_s:.0f} s left")
+            spoke = now
 
     return report
+
+
+@contextmanager
+def lasting(report: Progress, seconds: float, stage: str) -> Iterator[None]:
+    """Report work that takes a known time, which cannot say itself how much of it is done."""
+    began, over = time.monotonic(), threading.Event()
+
+    def advance() -> None:
+        while not over.wait(0.2):
+            report(min(0.99, (time.monotonic() - began) / seconds), stage)
+
+    report(0.0, stage)
+    thread = threading.Thread(target=advance, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 @contextmanager

@@ -29,10 +29,14 @@ def plan(
         "File to write; of several chains also a folder, for a plan each. Must not exist.",
     ),
     latencies: Path | None = opt.option(
-        "--latencies FILE", "Instead of a recording: a duration a line, or .npy in ns."
+        "--latencies FILE",
+        "Instead of a recording: a duration a line, or .npy in ns.",
+        rich_help_panel=opt.EVIDENCE,
     ),
     period: int | None = opt.option(
-        "--period DURATION>0", "Period, with --latencies or a chain that no timer starts."
+        "--period DURATION>0",
+        "Period, with --latencies or a chain that no timer starts.",
+        rich_help_panel=opt.EVIDENCE,
     ),
     *,
     since: int = opt.SINCE,
@@ -48,6 +52,7 @@ def plan(
     convert: Path | None = opt.option(
         "--convert OLD.yaml",
         "Plan nothing: write the plan of an earlier version anew, to --output.",
+        rich_help_panel=opt.EVIDENCE,
     ),
     json: bool = opt.JSON,
 ) -> None:
@@ -69,19 +74,21 @@ def plan(
     _check_curve(curve, request)
     wanted: list[str | None] = [*chain] if chain else [None]
     mode_recordings = opt.mode_profiles(mode_profile, request)
-    source = None if recording is None else cs.open_source(recording)
-    if source is not None:
-        profiles = cs.profile_chains(
-            source,
-            [*wanted, *(sink or [])],
-            period_ns=period,
-            modes=request.modes,
-            mode_recordings=mode_recordings,
-            since_ns=since,
-            until_ns=until,
-        )
-    else:
+    source = None
+    if recording is None:
         profiles = _profile_of_latencies(latencies, period, [*wanted, *(sink or [])], since, until)
+    else:
+        with out.opened("plan", [recording]) as (source, report):
+            report(0.5, "measuring the chains")
+            profiles = cs.profile_chains(
+                source,
+                [*wanted, *(sink or [])],
+                period_ns=period,
+                modes=request.modes,
+                mode_recordings=mode_recordings,
+                since_ns=since,
+                until_ns=until,
+            )
     planned, sinks = profiles[: len(wanted)], profiles[len(wanted) :]
     taken = () if source is None else taken_chain(source, wanted[0], planned[0].spec or "")
     doubts = _doubts_about(profiles, taken, request)
@@ -90,13 +97,18 @@ def plan(
             raise InputError("--sink goes with one chain: name the other output with --chain, too")
         if curve is not None:
             raise InputError("--curve goes with one chain: plan it alone")
-        joint, remarks = planning.plan_application(planned, request)
+        with out.late_progress("plan") as report:
+            report(0.5, "planning the chains together")
+            joint, remarks = planning.plan_application(planned, request)
         _print_several(joint.chains, remarks + doubts, output, json)
         return
-    chain_plan = cs.plan_chain(planned[0], request, sinks)
     choice = None
-    if request.bands == "auto":
-        choice = planning.band_choice(chain_plan, planned[0], request, sinks)
+    with out.late_progress("plan") as report:
+        report(0.5, "planning")
+        chain_plan = cs.plan_chain(planned[0], request, sinks)
+        if request.bands == "auto":
+            report(0.8, "choosing the number of bands")
+            choice = planning.band_choice(chain_plan, planned[0], request, sinks)
     if output is not None:
         cs.save_plan(cs.Plan.of(chain_plan), output)
     warnings = [*on_cores(profiles, request)[1], *doubts, *planning.plan_warnings(chain_plan)]
@@ -105,6 +117,7 @@ def plan(
     if _print_plan(chain_plan, choice, warnings, json):
         for path in filter(None, (curve, output)):
             out.show_line(path)
+        _next_with(output)
 
 
 def _doubts_about(
@@ -168,6 +181,7 @@ def _convert(earlier: Path, output: Path | None, json: bool, *, alone: bool) -> 
     cs.save_plan(cs.convert_plan(earlier), output)
     if out.present(json, {"files": [str(output)]}):
         out.show_line(output)
+        _next_with(output)
 
 
 def _profile_of_latencies(
@@ -205,10 +219,12 @@ def offsets(
     Plans do not say by how much chains that cannot take turns on a core would delay each other:
     `plan` with a `--chain` for each measures that.
     """
-    placed, remarks = cs.place_chains(
-        [chain for path in plans for chain in cs.load_plan(path).chains],
-        time_limit_s=time_limit,
-    )
+    chains = [chain for path in plans for chain in cs.load_plan(path).chains]
+    with (
+        out.late_progress("offsets") as report,
+        out.lasting(report, time_limit, f"searching, {time_limit:g} s per group at most"),
+    ):
+        placed, remarks = cs.place_chains(chains, time_limit_s=time_limit)
     _print_several(placed, remarks, output, json)
 
 
@@ -235,6 +251,15 @@ def _print_several(
         out.notes(warnings)
         for path in written:
             out.show_line(path)
+        _next_with(output)
+
+
+def _next_with(plan: Path | None) -> None:
+    """Say what comes behind planning: the plan is put in force, or first of all kept."""
+    if plan is None:
+        out.say("next: the same with `-o plan.yaml` keeps the plan")
+    else:
+        out.next_step("chainshaper", "apply", plan, "--dry-run")
 
 
 def sweep(
@@ -303,6 +328,7 @@ def sweep(
         out.notes(changing_nothing(frame, sweep_axes(frame)))
         for path in filter(None, (draw, output)):
             out.show_line(path)
+        out.next_step("chainshaper", "simulate", application, "-o", "simulated")
 
 
 def splice(
@@ -324,14 +350,21 @@ def splice(
     message_type: str | None = opt.option(
         "--type PKG/msg/TYPE",
         "Type of the output, for a node in C++. Default: what the recording says.",
+        rich_help_panel=opt.NODE_PANEL,
     ),
     recording: Path | None = opt.option(
         "--recording REC",
         "A recording of the application: it tells publishers, subscribers and types. "
         "Default: the plan's own, where it exists.",
+        rich_help_panel=opt.NODE_PANEL,
     ),
-    fallback: Fallback | None = opt.wish("fallback", default=None),
-    build: bool = opt.option("--build", "Build the shaping node's package with colcon.", False),
+    fallback: Fallback | None = opt.wish("fallback", default=None, rich_help_panel=opt.NODE_PANEL),
+    build: bool = opt.option(
+        "--build",
+        "Build the shaping node's package with colcon.",
+        False,
+        rich_help_panel=opt.NODE_PANEL,
+    ),
     dry_run: bool = opt.option(
         "--dry-run",
         "Write nothing, and show what would be redirected: the launch files are carried out in "
@@ -367,46 +400,58 @@ def splice(
     arguments = {} if ran else dict(word.split(":=", 1) for word in words if ":=" in word)
     files = words if ran else [word for word in words if ":=" not in word]
     if throttle:
-        if fallback is not None:
-            raise InputError("a throttler has no fallback: --fallback goes with a plan")
-        if message_type is not None:
-            raise InputError("a throttler is for all types: leave out --type")
-        if not files:
-            usage = "`splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`"
-            raise InputError(f"give the launch files: {usage}")
-        splicing = cs.splice_throttlers(
-            throttled_inputs(throttle),
-            files,
-            output,
-            node=node,
-            builds=build,
-            arguments=arguments,
-            recording=opt.recording_of(recording),
-            dry_run=dry_run,
-        )
+        _refuse_for_throttlers(fallback, message_type, files)
     elif plan is None or not files:
         raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
-    else:
-        planned = cs.load_plan(plan)
-        out.warn(planned)
-        splicing = cs.splice_launch_files(
-            planned,
-            files,
-            output,
-            node=node,
-            builds=build,
-            arguments=arguments,
-            message_type=message_type,
-            recording=opt.recording_of(recording, planned),
-            fallback=fallback,
-            dry_run=dry_run,
-        )
+    with out.late_progress("splice") as report:
+        report(0.0, "looking into the launch files")
+        if throttle:
+            splicing = cs.splice_throttlers(
+                throttled_inputs(throttle),
+                files,
+                output,
+                node=node,
+                builds=build,
+                arguments=arguments,
+                recording=opt.recording_of(recording),
+                dry_run=dry_run,
+            )
+        else:
+            planned = cs.load_plan(str(plan))
+            out.warn(planned)
+            splicing = cs.splice_launch_files(
+                planned,
+                files,
+                output,
+                node=node,
+                builds=build,
+                arguments=arguments,
+                message_type=message_type,
+                recording=opt.recording_of(recording, planned),
+                fallback=fallback,
+                dry_run=dry_run,
+            )
     has_packages = any(process.package is not None for process in splicing.processes)
     setup = None
     if build and not dry_run and has_packages:
-        setup = build_package(splicing.folder / NODES)
+        with out.progress("splice") as report:
+            report(0.0, "building the shaping node, which takes a minute or more")
+            setup = build_package(splicing.folder / NODES)
     if out.present(json, _splicing_json(splicing, setup)):
         _show_splicing(splicing, arguments, setup, dry_run=dry_run)
+
+
+def _refuse_for_throttlers(
+    fallback: Fallback | None, message_type: str | None, files: Sequence[str]
+) -> None:
+    """Refuse what belongs to a plan where there is none. Raises InputError."""
+    if fallback is not None:
+        raise InputError("a throttler has no fallback: --fallback goes with a plan")
+    if message_type is not None:
+        raise InputError("a throttler is for all types: leave out --type")
+    if not files:
+        usage = "`splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`"
+        raise InputError(f"give the launch files: {usage}")
 
 
 def throttled_inputs(inputs: Sequence[str]) -> "list[cs.ThrottledInput]":

@@ -44,6 +44,7 @@ BUFFER: int | None = opt.option(
     "--buffer MIB",
     "LTTng's buffer of each core, in MiB, for when events were lost. Default: 4.",
     min=1,
+    rich_help_panel=opt.TRACING,
 )
 
 
@@ -146,6 +147,7 @@ def init(
 
     write_whole(new_file(output, opt.DESCRIPTIONS), [synthetic_chain().read_bytes()])
     out.show_line(output)
+    out.next_step("chainshaper", "run", output, "-o", "before")
 
 
 def run(
@@ -168,6 +170,7 @@ def run(
         )
     out.notes((f"skipped {WARM_UP_CYCLES} warm-up cycles", *recording.info.notes))
     out.show_line(recording.path)
+    out.next_step("chainshaper", "plan", recording.path, "-o", "plan.yaml")
 
 
 def simulate(
@@ -192,11 +195,12 @@ def simulate(
     from chainshaper.reporting.latency import verdict
 
     described = cs.load_application(application)
-    if execution_times is not None:
-        from chainshaper.simulation.simulating import with_recorded_times
-
-        described = with_recorded_times(described, execution_times, block=block)
     with out.late_progress(f"simulating {described.name}") as report:
+        if execution_times is not None:
+            from chainshaper.simulation.simulating import with_recorded_times
+
+            report(0.0, f"reading execution times from {execution_times}")
+            described = with_recorded_times(described, execution_times, block=block)
         recording = cs.simulate(
             described,
             output,
@@ -213,6 +217,7 @@ def simulate(
         for measurement in comparison.measurements:
             out.notes([f"{comparison.chain}: {verdict(measurement)[1]}"])
     out.show_line(recording.path)
+    out.next_step("chainshaper", "latency", recording.path)
 
 
 def generate(
@@ -231,6 +236,7 @@ def generate(
     value = {"package": output.name, "folder": str(output), "files": list(map(str, files))}
     if out.present(json, value):
         out.show_line(output)
+        out.next_step("colcon", "build", "--base-paths", output)
 
 
 def record(
@@ -242,6 +248,7 @@ def record(
         "--pid",
         "Attach to this process and what it has started (ebpf, preload; may be repeated). "
         "Default, without a COMMAND: everything of the users that looks like ROS 2.",
+        rich_help_panel=opt.TRACING,
     ),
     user: list[str] | None = opt.USERS,
     buffer: int | None = BUFFER,
@@ -275,11 +282,14 @@ def record(
             stop=stop,
             progress=out.stage_lines("record"),
         )
-    _show_recorded(recorded, json=json)
+    _show_recorded(recorded, "chains", json=json)
 
 
-def _show_recorded(recorded: "cs.Recorded", *, json: bool) -> None:
-    """Show what was recorded. Raises OperationError: the command ended with an error."""
+def _show_recorded(recorded: "cs.Recorded", *then: str, json: bool) -> None:
+    """Show what was recorded, and the command for it that comes ``then``.
+
+    Raises OperationError: the command ended with an error.
+    """
     from chainshaper.linux.child_processes import end_in_words
 
     recording = recorded.recording
@@ -297,6 +307,9 @@ def _show_recorded(recorded: "cs.Recorded", *, json: bool) -> None:
     if recorded.exit_code:
         ended = f"the command {end_in_words(recorded.exit_code)}"
         raise OperationError(f"{ended}; what was recorded until then is in {recording.path}")
+    if not json:
+        verb, *options = then
+        out.next_step("chainshaper", verb, recording.path, *options)
 
 
 def watch(
@@ -319,23 +332,31 @@ def watch(
         "--budget FILE",
         "What chains, hops and callbacks may take in the last minute: a limit that breaks is said,"
         " and the last ten seconds are written.",
+        rich_help_panel="Budgets",
     ),
     recorder: Path = opt.option(
         "--recorder DIR",
         "Where these are written, also by Ctrl-\\: recordings in folders named by their time.",
         Path(),
+        rich_help_panel="Budgets",
     ),
     metrics: int | None = opt.option(
         "--metrics PORT",
         "Serve OpenMetrics (Prometheus) on this port of this machine.",
         min=1,
         max=65535,
+        rich_help_panel="Other programs",
     ),
     otlp: str | None = opt.option(
-        "--otlp URL", "Send metrics there every ten seconds, by OTLP over HTTP (OpenTelemetry)."
+        "--otlp URL",
+        "Send metrics there every ten seconds, by OTLP over HTTP (OpenTelemetry).",
+        rich_help_panel="Other programs",
     ),
     diagnostics: bool = opt.option(
-        "--diagnostics", "Publish the chains on /diagnostics, with the ROS 2 of the nodes.", False
+        "--diagnostics",
+        "Publish the chains on /diagnostics, with the ROS 2 of the nodes.",
+        False,
+        rich_help_panel="Other programs",
     ),
     user: list[str] | None = opt.USERS,
     environment: bool = opt.option(
@@ -503,17 +524,20 @@ def profile(
         "--like REC",
         "An earlier recording of the application: it knows the chain's nodes, components "
         "of containers, and executors with several threads.",
+        rich_help_panel=opt.THREADS,
     ),
     node: list[str] | None = opt.option(
         "--node NAME",
         "A node that gets the priority (may be repeated, the most urgent first). Default: the "
         "chain's, or all, at one priority.",
+        rich_help_panel=opt.THREADS,
     ),
     core: int | None = opt.option(
         "--core",
         "Where executors run. Default: the last core; with --chain and --like, others as well where"
         " branches run at the same time. DDS threads run on the others.",
         min=0,
+        rich_help_panel=opt.THREADS,
     ),
     request: "cs.PlanRequest",
     source: opt.Source | None = opt.SOURCE,
@@ -575,7 +599,7 @@ def profile(
             stop=stop,
             progress=out.stage_lines("record"),
         )
-    _show_recorded(recorded, json=json)
+    _show_recorded(recorded, "plan", "-o", "plan.yaml", json=json)
 
 
 @opt.takes_wishes(*opt.PLAN_WISHES)
@@ -591,8 +615,14 @@ def shape(
         "Folder for the recording; of a launched application, for everything.",
         ...,
     ),
-    cycles: int = opt.CYCLES,
-    realtime: bool | None = opt.REALTIME,
+    cycles: int = opt.option(
+        "--cycles", "Cycles to record.", 320, min=1, rich_help_panel="A described application"
+    ),
+    realtime: bool | None = opt.option(
+        "--realtime/--no-realtime",
+        "Use SCHED_FIFO. Default: where it is permitted.",
+        rich_help_panel="A described application",
+    ),
     chain: list[str] | None = opt.option(
         "--chain FIRST..LAST",
         "The chain, by topics or nodes: /t1../t5. Several are shaped together. Default: you are"
@@ -603,9 +633,12 @@ def shape(
         "--throttle NODE:TOPIC=PERIOD",
         "A throttler before an input of NODE that is not quite periodic, from the first recording"
         " on (may be repeated).",
+        rich_help_panel=opt.EVIDENCE,
     ),
     period: int | None = opt.option(
-        "--period DURATION>0", "Period of a chain that no timer starts."
+        "--period DURATION>0",
+        "Period of a chain that no timer starts.",
+        rich_help_panel=opt.EVIDENCE,
     ),
     duration: int = opt.option(
         "--duration DURATION>0",
@@ -616,7 +649,12 @@ def shape(
     until: int | None = opt.UNTIL,
     source: opt.Source | None = opt.SOURCE,
     node: NodeChoice = opt.NODE,
-    backend: str = opt.option("--backend NAME", "As for `chainshaper apply`.", "auto"),
+    backend: str = opt.option(
+        "--backend NAME",
+        "As for `chainshaper apply`.",
+        "auto",
+        rich_help_panel=opt.IN_FORCE,
+    ),
     adapt: bool = opt.ADAPT,
     max_latency: int | None = opt.MAX_LATENCY,
     *,
@@ -687,7 +725,8 @@ def _show_shaped_recording(recording: "cs.Recording", *, strict: bool) -> None:
     """Show what gates did in a recording of a described application, and judge it."""
     from chainshaper.verify.overruns import dropped_text, overruns_text
 
-    comparisons = cs.compare_chains([recording], least=1)
+    with out.late_progress("shape") as report:
+        comparisons = cs.compare_chains([recording], least=1, progress=report)
     for comparison in comparisons:
         about = f"{comparison.chain}: " if len(comparisons) > 1 else ""
         (measured,) = comparison.measurements
@@ -698,6 +737,7 @@ def _show_shaped_recording(recording: "cs.Recording", *, strict: bool) -> None:
     out.notes(recording.info.notes)
     out.show_line(recording.path)
     judge(comparisons, strict=strict, json=False)
+    out.next_step("chainshaper", "report", recording.path, "-o", "report.html")
 
 
 def _show_shaped_launch(

@@ -33,6 +33,7 @@ def info(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
     if out.present(json, contents, *overviews.contents_table(recording)):
         out.show_line(out.lost_events(recording))
         out.notes((*contents["notes"], *(contradiction.note for contradiction in contradictions)))
+        out.next_step("chainshaper", "chains", *trace)
 
 
 def describe(
@@ -52,6 +53,7 @@ def describe(
         text, notes = application_file(recording, chain)
         out.notes(notes)
     out.show_line(write_whole(output, [text.encode()]))
+    out.next_step("chainshaper", "simulate", output, "-o", "simulated")
 
 
 def graph(
@@ -85,6 +87,7 @@ def graph(
         out.show(graph_drawing.application_table(chosen))
         out.show_line(out.lost_events(recording))
         out.notes(application.notes)
+        out.next_step("chainshaper", "chains", *trace)
     else:
         out.show_line(output.absolute())
         out.notes((*application.notes, out.lost_events(recording)))
@@ -102,6 +105,7 @@ def callbacks(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
     if out.present(json, rows, table):
         out.show_line(out.lost_events(recording))
         out.notes((*recording.info.notes, *flow.notes))
+        out.next_step("chainshaper", "chains", *trace)
     else:  # the JSON is an array, which has no place for notes
         out.notes(contradiction.note for contradiction in flow.contradictions)
         if any(recording.info.lost.values()):
@@ -136,6 +140,8 @@ def chains(
     if out.present(json, values, overviews.chain_table(application, listed)):
         out.show_line(f"{overviews.count_text(listed)}; {out.lost_events(recording)}")
         out.notes(remarks)
+        if listed.chains:
+            out.next_step("chainshaper", "latency", *trace, "--chain", listed.chains[0].spec)
 
 
 def latency(
@@ -143,6 +149,11 @@ def latency(
     chain: str | None = opt.CHAIN,
     chains: Path | None = opt.option(
         "--chains FILE", "A CARET architecture file: --chain then names one of its named_paths."
+    ),
+    figures: Path | None = opt.option(
+        "--figures DIR",
+        "Draw latency.png, hops.png (every cycle, stacked by hop), distribution.png and graph.png"
+        " (the nodes, with times) into this folder.",
     ),
     json: bool = opt.JSON,
     instances: bool = opt.option("--instances", "With --json: every traversal, one by one.", False),
@@ -158,15 +169,25 @@ def latency(
     if instances and not json:
         raise InputError("--instances goes with --json: add it")
     chain = chain if chains is None else named_chain(chains, chain)
-    with out.opened("latency", trace) as (recording, _):
+    named = () if chain is None else ("--chain", chain)
+    with out.opened("latency", trace) as (recording, report):
         measurement = cs.measure_latency(recording, chain)
+        drawn: tuple[Path, ...] = ()
+        if figures is not None:
+            from chainshaper.reporting.figures import draw_measurement
+
+            report(0.8, "drawing")
+            drawn = draw_measurement(measurement, figures)
     analysis = measurement.analysis
     values = of_chain.latency_json(measurement, instances=instances)
     values |= of_chain.breakdown_json(analysis)
     tables = of_chain.latency_table(measurement), of_chain.breakdown_table(analysis)
     if out.present(json, values, *tables):
         out.show_line(f"{of_chain.doubts_text(measurement)}; {out.lost_events(recording)}")
+        for path in drawn:
+            out.show_line(path)
         out.notes(analysis.notes)
+        out.next_step("chainshaper", "plan", *trace[:1], *named, "-o", "plan.yaml")
 
 
 def convert(trace: list[Path] = opt.TRACE, output: Path = opt.RECORDING_OUTPUT) -> None:
@@ -178,6 +199,7 @@ def convert(trace: list[Path] = opt.TRACE, output: Path = opt.RECORDING_OUTPUT) 
         written = cs.convert_recording(recording, output)
     out.show_line(written.path.absolute())
     out.notes((*written.info.notes, out.lost_events(written)))
+    out.next_step("chainshaper", "chains", output)
 
 
 FEW = 3  # more recordings than these get an overview
@@ -203,6 +225,7 @@ def budget(
     out.show_line(save_budget(proposed, output))
     if not chain:
         out.notes(taken_chain(recording, None, proposed.chains[0].chain))
+    out.next_step("chainshaper", "check", *trace[:1], "--budget", output)
 
 
 def _matching(recordings: list[Path]) -> list[Path]:
@@ -386,7 +409,7 @@ def compare(
     recordings: list[Path] = opt.argument("REC REC...", "Recordings' folders.", ...),
     chain: str | None = opt.CHAIN,
     figures: Path | None = opt.option(
-        "--figures DIR", "Draw latency.png and distribution.png into this folder."
+        "--figures DIR", "Draw latency.png, hops.png and distribution.png into this folder."
     ),
     plan: Path | None = opt.PLAN_IN_FORCE,
     strict: bool = opt.STRICT,
@@ -400,16 +423,21 @@ def compare(
     """
     from chainshaper.reporting.latency import comparisons_json
 
-    comparisons = cs.compare_chains(recordings, chain, opt.plan_in_force(plan))
-    if figures is not None:
-        from chainshaper.reporting.figures import draw_comparison
+    in_force = opt.plan_in_force(plan)
+    with out.late_progress("compare") as progress:
+        comparisons = cs.compare_chains(recordings, chain, in_force, progress=progress)
+        if figures is not None:
+            from chainshaper.reporting.figures import draw_comparison
 
-        if len(comparisons) > 1:
-            raise InputError("--figures draws one chain: name it with --chain")
-        draw_comparison(comparisons[0].measurements, figures)
+            if len(comparisons) > 1:
+                raise InputError("--figures draws one chain: name it with --chain")
+            progress(0.9, "drawing")
+            draw_comparison(comparisons[0].measurements, figures)
     out.present(json, comparisons_json(comparisons), *comparison_tables(*comparisons))
     out.notes(taken_chains(comparisons, chain))
     judge(comparisons, strict=strict, json=json)
+    if not json:
+        out.next_step("chainshaper", "report", *recordings, "-o", "report.html")
 
 
 def report(

@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 from chainshaper.analysis import LatencyAnalysis, analyse_latency, recorded_flow
 from chainshaper.analysis.contradictions import refuse_contradicted
@@ -13,10 +14,16 @@ from chainshaper.flow.recorded_profile.modes import modes_in_force
 from chainshaper.flow.recorded_profile.stages import Stage, graph_stages
 from chainshaper.planning import Modes, Plan, PlanRequest, Profile, plan_chain
 from chainshaper.planning.latencies import read_latencies
+from chainshaper.planning.request import with_keywords
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.verify.measure import chain_of, opened
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from chainshaper.planning.request import RequestKeywords
 
 _STANDARD = PlanRequest()
 
@@ -116,14 +123,17 @@ def plan_recording(
     *,
     period_ns: int | None = None,
     sinks: Sequence[str] = (),
+    **wishes: "Unpack[RequestKeywords]",
 ) -> Plan:
     """Plan a recorded chain: single-band shaping (eq. 1, 4) unless ``request`` says otherwise.
 
+    ``wishes`` are fields of the request, such as ``bands=3``, in place of those in ``request``.
     ``sinks`` are chains to further outputs of the same graph. Raises: as :func:`profile_chains`
     and :func:`~chainshaper.planning.plan_chain`.
     """
     if not isinstance(chain, str | None):
         raise InputError("one chain goes here: profile several, and plan with `plan_application`")
+    request = with_keywords(request, wishes)
     wanted = (chain, *sinks)
     profile, *further = profile_chains(recording, wanted, period_ns=period_ns, modes=request.modes)
     return Plan.of(plan_chain(profile, request, further))

@@ -22,7 +22,14 @@ from typing import Annotated, Literal, NamedTuple, TypeAlias
 from pydantic import AfterValidator, Field, model_validator
 
 from chainshaper.robot.gate import Anchor, IntoOpenSlot, Late, Messages, Overrun
-from chainshaper.values.durations import duration_text, format_duration, parse_duration
+from chainshaper.values.durations import (
+    duration_text,
+    format_duration,
+    milliseconds,
+    parse_duration,
+)
+from chainshaper.values.errors import shown
+from chainshaper.values.notebook import notebook_html
 from chainshaper.values.plan_choices import (
     EqualPriorities,
     Fallback,
@@ -352,6 +359,17 @@ class ChainPlan(Part):
     modes: Modes | None = None
     adaptation: Adaptation | None = None
     predicted: Prediction
+
+    def __repr__(self) -> str:
+        slots = ", ".join(slot_text(slot) for slot in publish_slots(self))
+        parts = [self.policy, f"cycle {duration_text(self.cycle_ns)}"]
+        parts += [f"outputs in {slots}"] if slots else []
+        parts += [f"average {milliseconds(self.predicted.mean_ns)} ms"]
+        parts += [f"jitter {milliseconds(self.predicted.jitter_ns)} ms at most"]
+        return shown(f"ChainPlan({self.chain.spec or 'a chain'}: {', '.join(parts)})")
+
+    __str__ = __repr__
+    _repr_html_ = notebook_html
 
     @model_validator(mode="after")
     def _consistent(self) -> "ChainPlan":

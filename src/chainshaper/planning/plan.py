@@ -33,6 +33,7 @@ from chainshaper.planning.overruns import in_cycle, slots_without, united, with_
 from chainshaper.planning.overruns import open_until_done as chain_open_until_done
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError
+from chainshaper.values.notebook import notebook_html
 from chainshaper.values.yaml_file import Part, wrong_value, wrong_values_refused
 
 _GRID_NS = 1_000  # moved slots are found to microseconds
@@ -50,6 +51,13 @@ class Plan(Part):
 
     format: Literal[2] = 2
     chains: Annotated[tuple[ChainPlan, ...], Field(min_length=1)]
+
+    def __repr__(self) -> str:
+        chains = "; ".join(repr(chain)[len("ChainPlan(") : -1] for chain in self.chains)
+        return f"Plan({chains})"
+
+    __str__ = __repr__
+    _repr_html_ = notebook_html
 
     @model_validator(mode="before")
     @classmethod

@@ -7,10 +7,10 @@ for makes that output later than it was measured, so such chains are refused.
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
 from itertools import combinations, permutations
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +49,7 @@ from chainshaper.planning.profile import (
 from chainshaper.planning.receivers import with_receivers_placed, without_reception
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
-from chainshaper.values.plan_choices import Policy, Wishes
+from chainshaper.values.plan_choices import Policy, Wishes, WishKeywords
 
 DEFAULT_CORE = 1
 OWN_SLOTS = (*plans.PER_CALLBACK, "let-per-chain")
@@ -63,6 +63,27 @@ class PlanRequest(Wishes):
     modes: Modes | None = None  # the modes of the system, each with a band
     # Whether the user gave each mode's band, or it is placed from the latencies in that mode.
     bands_of_modes: Literal["given", "found"] = "given"
+
+
+class RequestKeywords(WishKeywords, total=False):
+    """The fields of :class:`PlanRequest` as keyword arguments, for type checkers and editors."""
+
+    modes: Modes | None
+    bands_of_modes: Literal["given", "found"]
+
+
+def with_keywords(request: PlanRequest, keywords: Mapping[str, Any]) -> PlanRequest:
+    """Return a request with the fields that keyword arguments name.
+
+    Raises InputError: a request has no field of such a name.
+    """
+    known = [field.name for field in fields(PlanRequest)]
+    for name in keywords:
+        if name not in known:
+            near = get_close_matches(name, known, n=1)
+            meant = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
+            raise InputError(f"a plan request has no field {name!r}: {meant}")
+    return replace(request, **keywords)
 
 
 _STANDARD = PlanRequest()

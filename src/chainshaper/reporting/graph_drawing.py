@@ -1,11 +1,12 @@
-"""The application graph: as plain data, as a table, and as a picture (SVG, or DOT for Graphviz).
+"""The application graph: as plain data, as a table, and as a picture (SVG, PNG, DOT for Graphviz).
 
 Nodes are boxes of callbacks, with topics between them; arrows run from the callback that publishes
 a topic to the callbacks that it triggers. A dashed arrow is a topic that another callback of the
 node publishes for this one (synchronisers, stored messages). An arrow at a node's title stands for
 publications outside its callbacks, or for subscriptions without callback events. The services and
 topics that every node has (parameter services, /rosout, /parameter_events) are left out of tables
-and pictures unless asked for; in JSON they are marked.
+and pictures unless asked for; in JSON they are marked. With a chain, arrows and callbacks have the
+times that were recorded, and the chain's own arrows are thick.
 
 The layout is that of Sugiyama, Tagawa and Toda (1981). Edges that close cycles are turned around.
 Every box gets a column, as far left as its predecessors permit. Columns are sorted so that few
@@ -24,22 +25,27 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+import polars as pl
 
+from chainshaper.analysis import DataFlow, callback_statistics
 from chainshaper.analysis.chains import depth_first_order
+from chainshaper.analysis.edge_times import edge_times
 from chainshaper.analysis.graph import ApplicationDescription
 from chainshaper.planning.offsets import linked
-from chainshaper.reporting.tables import Column, ResultTable, listed, words
+from chainshaper.reporting.tables import Column, ResultTable, listed, ms, words
 from chainshaper.values.application import (
     INTERNAL_SERVICES,
     INTERNAL_TOPICS,
+    ApplicationGraph,
     Callback,
+    Chain,
     period_text,
 )
 from chainshaper.values.errors import escape, shown
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.recording import lost_text
 
-ENDINGS = (".svg", ".dot", ".json")
+ENDINGS = (".svg", ".png", ".dot", ".json")
 
 _LEFT_OUT_TOPICS = INTERNAL_TOPICS - {"/clock"}
 _LAMBDA = re.compile(r"\{lambda\(.*?\)#(\d+)\}$")
@@ -47,6 +53,7 @@ _BIND = re.compile(r"std::_Bind<.*?\((\w[\w:]*)::\*")
 
 # Lengths in pixels.
 COLUMN_GAP = 48.0
+TIMED_GAP = 84.0  # of columns between which arrows have times
 ROW_GAP = 22.0
 PLACE_HEIGHT = 6.0  # of the place of an edge that passes a column
 SWEEPS = 16  # how often columns are swept, to sort them and to choose heights
@@ -54,6 +61,7 @@ SWEEPS = 16  # how often columns are swept, to sort them and to choose heights
 MARGIN = 24.0
 CHARACTER = 7.3  # width of a character of 12 px
 SMALL = 6.3  # width of a character of 10 px
+MOST_NODES = 40  # of a picture with times; of more, the chain's alone are drawn
 TITLE, ROW, PILL, PAD = 28.0, 36.0, 26.0, 10.0
 TURN = 45.0  # how far an arrow goes on before it turns around
 LONGEST = 46  # characters of a function's name
@@ -64,16 +72,20 @@ COLOURS = {
     "client": "#3b7d4f",
     "unknown": "#777777",
 }
+# A report has several pictures beside other drawings: each rule is for these pictures alone.
 _DEFINED = """\
-<defs><marker id="tip" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="7" markerHeight="7"
-  orient="auto-start-reverse"><path d="M 0 1 L 10 5 L 0 9 z" fill="#555"/></marker><style>
-text { font-family: "DejaVu Sans", Verdana, Helvetica, Arial, sans-serif; font-size: 12px;
-  fill: #1a1a1a; }
-.title { font-weight: bold; } .small { font-size: 10px; fill: #666; }
-.node { fill: #fff; stroke: #444; stroke-width: 1.3; } .head { fill: #eceff3; }
-.line { stroke: #d5d9df; } .topic { fill: #fff6d6; stroke: #b8962e; }
-.arrow { fill: none; stroke: #555; stroke-width: 1.3; marker-end: url(#tip); }
-.passes { stroke-dasharray: 5 4; } .back { stroke: #b03a3a; }
+<defs><marker id="graph-tip" viewBox="0 0 10 10" refX="9" refY="5" markerUnits="userSpaceOnUse"
+  markerWidth="9" markerHeight="9" orient="auto-start-reverse">
+  <path d="M 0 1 L 10 5 L 0 9 z" fill="#555"/></marker><style>
+.graph text { font: 12px "DejaVu Sans", Verdana, Helvetica, Arial, sans-serif; fill: #1a1a1a; }
+.graph .title { font-weight: bold; } .graph .small { font-size: 10px; fill: #666; }
+.graph .node { fill: #fff; stroke: #444; stroke-width: 1.3; } .graph .head { fill: #eceff3; }
+.graph .line { stroke: #d5d9df; } .graph .topic { fill: #fff6d6; stroke: #b8962e; }
+.graph .arrow { fill: none; stroke: #555; stroke-width: 1.3; marker-end: url(#graph-tip); }
+.graph .passes { stroke-dasharray: 5 4; } .graph .back { stroke: #b03a3a; }
+.graph .chain { stroke-width: 3; }
+.graph .time { font-size: 10px; fill: #8a3d00; stroke: #fff; stroke-width: 3;
+  paint-order: stroke; }
 </style></defs>"""
 
 
@@ -181,6 +193,32 @@ def short_symbol(symbol: str | None) -> str:
     return f"{text} λ{ending[1]}" if ending else text
 
 
+class Time(NamedTuple):
+    """How long something took, of all that was recorded (ns)."""
+
+    mean: float
+    max: int
+    samples: int
+
+    @property
+    def text(self) -> str:
+        """Text: the mean, and the maximum."""
+        return f"{ms(self.mean)} ms, max {ms(self.max)}"
+
+
+@dataclass(frozen=True)
+class GraphTimes:
+    """The times that a picture has beside arrows and callbacks, and the chain in it."""
+
+    communication: Mapping[tuple[str, int], Time]  # topic and id of the callback that got it
+    response: Mapping[int, Time]  # id of the callback
+    reads: frozenset[tuple[str, int]]  # topics and callbacks of the chain
+    writes: frozenset[tuple[int, str]]  # callbacks and topics of the chain
+
+
+NO_TIMES = GraphTimes({}, {}, frozenset(), frozenset())
+
+
 @dataclass(frozen=True)
 class _NodeBox:
     """A node in the picture: a title, and a row for each callback."""
@@ -189,13 +227,16 @@ class _NodeBox:
     pid: int
     processes: str  # their ids, several of a node that was started again
     callbacks: Sequence[Callback]
+    times: Mapping[int, Time]  # of callbacks, by id
 
     @property
     def box(self) -> "Box":
         widths = [CHARACTER * (len(self.name) + 1) + SMALL * (len(self.processes) + 4)]
         for callback in self.callbacks:
             trigger, function = _row_texts(callback)
-            widths += [CHARACTER * len(trigger) + 14, SMALL * len(function) + 14]
+            time = self.times.get(callback.id)
+            beside = SMALL * (len(time.text) + 2) if time is not None else 0.0
+            widths += [CHARACTER * len(trigger) + 14 + beside, SMALL * len(function) + 14]
         return Box(max(widths) + 2 * PAD, TITLE + ROW * len(self.callbacks))
 
     def svg(self, corner: Point) -> str:
@@ -220,6 +261,8 @@ class _NodeBox:
                 f'<text x="{PAD + 14}" y="{top + 16}">{escape(trigger)}</text>',
                 f'<text class="small" x="{PAD + 14}" y="{top + 29}">{escape(function)}</text></g>',
             ]
+            if (time := self.times.get(callback.id)) is not None:
+                parts.append(_time_text((width - PAD, top + 16), time.text, time.samples))
         return "\n".join([*parts, "</g>"])
 
 
@@ -230,7 +273,7 @@ def _row_texts(callback: Callback) -> tuple[str, str]:
     return trigger, function if len(function) <= LONGEST else function[: LONGEST - 1] + "…"
 
 
-def _nodes(application: ApplicationDescription) -> list[_NodeBox]:
+def _nodes(application: ApplicationDescription, times: GraphTimes = NO_TIMES) -> list[_NodeBox]:
     """Make a box for each node, and for each process of nodes that ran at the same time."""
     graph = application.graph
     rows: dict[tuple[str, int], list[Callback]] = {
@@ -240,27 +283,32 @@ def _nodes(application: ApplicationDescription) -> list[_NodeBox]:
         rows.setdefault((callback.node, callback.pid), []).append(callback)
     processes = {(node.name, node.pid): listed(node.processes) for node in graph.nodes}
     return [
-        _NodeBox(name, pid, processes.get((name, pid), str(pid)), callbacks)
+        _NodeBox(name, pid, processes.get((name, pid), str(pid)), callbacks, times.response)
         for (name, pid), callbacks in rows.items()
     ]
 
 
-def application_svg(application: ApplicationDescription) -> str:
+def application_svg(application: ApplicationDescription, times: GraphTimes = NO_TIMES) -> str:
     """Draw the picture, as the text of an SVG file."""
-    nodes = _nodes(application)
+    nodes = _nodes(application, times)
     topics = [t for t in application.graph.topics if t and not t.startswith("ros_")]
-    arrows = list(_arrows(application, nodes, topics))
+    arrows = list(_arrows(application, nodes, topics, times))
     pills = [Box(CHARACTER * len(topic) + 2 * PAD, PILL) for topic in topics]
-    layout = lay_out([*(node.box for node in nodes), *pills], [edge for edge, _ in arrows])
+    layout = lay_out(
+        [*(node.box for node in nodes), *pills],
+        [arrow.edge for arrow in arrows],
+        COLUMN_GAP if times is NO_TIMES else TIMED_GAP,
+    )
     width, height = layout.width + 2 * MARGIN, layout.height + 2 * MARGIN
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height:.0f}"'
-        f' viewBox="{-MARGIN} {-MARGIN} {width:.1f} {height:.1f}">',
+        f'<svg xmlns="http://www.w3.org/2000/svg" class="graph" width="{width:.0f}"'
+        f' height="{height:.0f}" viewBox="{-MARGIN} {-MARGIN} {width:.1f} {height:.1f}">',
         _DEFINED,
         f'<rect x="{-MARGIN}" y="{-MARGIN}" width="{width:.1f}" height="{height:.1f}"'
         ' fill="#fff"/>',
     ]
-    parts += [_arrow(route, style) for route, (_, style) in zip(layout.routes, arrows, strict=True)]
+    for route, arrow in zip(layout.routes, arrows, strict=True):
+        parts.append(_arrow(route, arrow.style))
     parts += [node.svg(corner) for node, corner in zip(nodes, layout.corners, strict=False)]
     for topic, pill, corner in zip(topics, pills, layout.corners[len(nodes) :], strict=True):
         parts.append(
@@ -268,20 +316,96 @@ def application_svg(application: ApplicationDescription) -> str:
             f'<rect class="topic" width="{pill.width:.1f}" height="{PILL:.1f}" rx="13"/>'
             f'<text x="{pill.width / 2:.1f}" y="17" text-anchor="middle">{escape(topic)}</text></g>'
         )
+    for route, arrow in zip(layout.routes, arrows, strict=True):
+        if arrow.time is not None:
+            x, y = route[-1]
+            mean, most = f"{ms(arrow.time.mean)} ms", f"max {ms(arrow.time.max)}"
+            parts.append(_time_text((x - 11, y - 5), mean, arrow.time.samples))
+            parts.append(_time_text((x - 11, y + 13), most, arrow.time.samples))
     if any(application.lost.values()):
         y, text = layout.height + MARGIN / 2, escape(lost_text(application.lost))
         parts.append(f'<text class="small" x="0" y="{y:.1f}">{text}</text>')
     return "\n".join([*parts, "</svg>", ""])
 
 
+def _time_text(end: Point, text: str, samples: int) -> str:
+    """Draw a time that ends at a point; pointing at it says of how many it is."""
+    x, y = end
+    return (
+        f'<text class="time" x="{x:.1f}" y="{y:.1f}" text-anchor="end">{text}'
+        f"<title>of {samples}</title></text>"
+    )
+
+
+def timed_graph_svg(flow: DataFlow, graph: ApplicationGraph, chain: Chain | None = None) -> str:
+    """Draw an application's graph with the times that were recorded, and a chain in it, as SVG.
+
+    Of more than `MOST_NODES` nodes, the chain's alone are drawn.
+    """
+    application = without_internals(ApplicationDescription(graph, pl.DataFrame(), {}, ()))
+    topics, callbacks = ((), ()) if chain is None else (chain.topics, chain.callbacks)
+    if chain is not None and len(graph.nodes) > MOST_NODES:
+        application = _with_nodes_alone(
+            application, {callback.node for callback in graph.path(chain)}
+        )
+    times = GraphTimes(
+        communication={
+            (row["topic"], row["callback_id"]): _time(row["communication_ns"], row["count"])
+            for row in edge_times(flow).iter_rows(named=True)
+        },
+        response={
+            row["callback_id"]: _time(row["response_ns"], row["count"] - row["unfinished"])
+            for row in callback_statistics(flow).iter_rows(named=True)
+            if row["response_ns"] is not None and row["response_ns"]["mean"] is not None
+        },
+        reads=frozenset(zip(topics, callbacks[1:], strict=False)),
+        writes=frozenset(zip(callbacks, topics, strict=True)),
+    )
+    return application_svg(application, times)
+
+
+def _time(figures: Mapping[str, Any], samples: int) -> Time:
+    return Time(figures["mean"], figures["max"], samples)
+
+
+def _with_nodes_alone(
+    application: ApplicationDescription, names: set[str]
+) -> ApplicationDescription:
+    """Return the application with these nodes, and the topics that they publish or read, alone."""
+    graph = application.graph
+    publishers, subscribers = (
+        {topic: kept for topic, ends in of_topics.items() if (kept := tuple(names & {*ends}))}
+        for of_topics in (graph.publishers, graph.subscribers)
+    )
+    left = replace(
+        graph,
+        nodes=tuple(node for node in graph.nodes if node.name in names),
+        callbacks=tuple(callback for callback in graph.callbacks if callback.node in names),
+        publishers=publishers,
+        subscribers=subscribers,
+    )
+    return replace(application, graph=left)
+
+
 def _group(corner: Point) -> str:
     return f'<g transform="translate({corner[0]:.1f} {corner[1]:.1f})">'
 
 
+class _Arrow(NamedTuple):
+    """An arrow in the picture: its class, and the time of the messages along it."""
+
+    edge: "Edge"
+    style: str = "arrow"
+    time: Time | None = None
+
+
 def _arrows(
-    application: ApplicationDescription, nodes: list[_NodeBox], topics: list[str]
-) -> Iterator[tuple["Edge", str]]:
-    """Yield the arrows with their classes, between callbacks and topics.
+    application: ApplicationDescription,
+    nodes: list[_NodeBox],
+    topics: list[str],
+    times: GraphTimes,
+) -> Iterator[_Arrow]:
+    """Yield the arrows between callbacks and topics.
 
     Where no callback of a node is known to publish or read a topic, its title has the arrow.
     """
@@ -292,18 +416,21 @@ def _arrows(
         reads: set[str | None] = set()
         for row, callback in enumerate(node.callbacks):
             height = TITLE + ROW * (row + 0.5)
-            if callback.trigger in place:
-                yield Edge(place[callback.trigger], index, PILL / 2, height), "arrow"
-                reads.add(callback.trigger)
+            if (trigger := callback.trigger) is not None and trigger in place:
+                edge, read = Edge(place[trigger], index, PILL / 2, height), (trigger, callback.id)
+                style = "arrow chain" if read in times.reads else "arrow"
+                yield _Arrow(edge, style, times.communication.get(read))
+                reads.add(trigger)
             for topic in filter(place.__contains__, callback.publishes):
                 style = "arrow passes" if topic in callback.passes_on else "arrow"
-                yield Edge(index, place[topic], height, PILL / 2), style
+                style += " chain" if (callback.id, topic) in times.writes else ""
+                yield _Arrow(Edge(index, place[topic], height, PILL / 2), style)
                 writes.add(topic)
         for topic in topics:
             if node.name in graph.publishers.get(topic, ()) and topic not in writes:
-                yield Edge(index, place[topic], TITLE / 2, PILL / 2), "arrow"
+                yield _Arrow(Edge(index, place[topic], TITLE / 2, PILL / 2))
             if node.name in graph.subscribers.get(topic, ()) and topic not in reads:
-                yield Edge(place[topic], index, PILL / 2, TITLE / 2), "arrow"
+                yield _Arrow(Edge(place[topic], index, PILL / 2, TITLE / 2))
 
 
 def _arrow(route: list[Point], style: str) -> str:
@@ -364,13 +491,15 @@ def _quoted(text: str) -> str:
 def write_picture(
     application: ApplicationDescription, path: str | Path, *, everything: bool = False
 ) -> Path:
-    """Write the graph as .svg, .dot or .json, by the ending of ``path``, whole or not at all.
+    """Write the graph as .svg, .png, .dot or .json, by ``path``'s ending, whole or not at all.
 
     Raises InputError: it exists, its folder does not, or its ending says no known format.
     OperationError: it cannot be written.
     """
     path = new_file(path, ENDINGS)
     drawn = application if everything else without_internals(application)
+    if path.suffix == ".png":
+        return write_whole(path, [png_of(application_svg(drawn))])
     if path.suffix == ".json":
         text = json.dumps(application_json(application), indent=2) + "\n"
     elif path.suffix == ".dot":
@@ -378,6 +507,15 @@ def write_picture(
     else:
         text = application_svg(drawn)
     return write_whole(path, [text.encode()])
+
+
+def png_of(svg: str) -> bytes:
+    """Paint a picture, twice as large as it is in SVG; its letters are matplotlib's."""
+    import matplotlib as mpl
+    import resvg_py
+
+    fonts = str(Path(mpl.get_data_path()) / "fonts" / "ttf")
+    return bytes(resvg_py.svg_to_bytes(svg_string=svg, zoom=2, font_dirs=[fonts]))
 
 
 class Box(NamedTuple):
@@ -439,8 +577,11 @@ class _ConnectedPart:
         return {v: place for column in self.columns for place, v in enumerate(column)}
 
 
-def lay_out(boxes: Sequence[Box], edges: Sequence[Edge]) -> Layout:
-    """Place boxes and edges; the cost is about that of sorting, times the number of sweeps."""
+def lay_out(boxes: Sequence[Box], edges: Sequence[Edge], gap: float = COLUMN_GAP) -> Layout:
+    """Place boxes and edges, with a ``gap`` between columns.
+
+    The cost is about that of sorting, times the number of sweeps.
+    """
     corners = [(0.0, 0.0)] * len(boxes)
     routes: list[list[Point]] = [[] for _ in edges]
     top, width = 0.0, 0.0
@@ -457,7 +598,7 @@ def lay_out(boxes: Sequence[Box], edges: Sequence[Edge]) -> Layout:
                 (boxes[vertex].width for vertex in column if vertex < len(boxes)), default=0.0
             )
             sides.append((left, right))
-            left = right + COLUMN_GAP
+            left = right + gap
         lowest = min(part.y.values())
         y = {vertex: height - lowest + top for vertex, height in part.y.items()}
         for vertex in members:

@@ -57,6 +57,9 @@ if TYPE_CHECKING:  # only the verbs `watch` and `budget` need these modules
 
 UNKNOWN = "unknown"
 COLOURS = {"good": "green", "limited": "yellow", "absent": "red"}
+MARKS = {"good": "✓", "limited": "!", "absent": "✗"}
+BACK_END = "back end "  # what the name of a back end's check begins with
+WORTH_SAYING_NS = 1_000_000  # of a stall: as long as the shortest slot
 MOST_ROWS = 50  # points of a sweep that a table shows
 MOST_SLOTS = 8  # slots of a server that a table shows
 SWEEP_FIGURES = {  # column of a sweep's frame → title
@@ -269,13 +272,32 @@ def machine_tables(report: MachineReport) -> tuple[ResultTable, ResultTable]:
     abilities = ResultTable("This machine", words("", "found", "for", "remedy"))
     for check in report.checks:
         finding = plain(check.found, COLOURS[check.state])
-        abilities.add(check.name, finding, check.needed_for, check.remedy)
+        name = f"{MARKS[check.state]} {check.name}"
+        abilities.add(name, finding, check.needed_for, check.remedy)
     threshold = duration_text(report.stall_meter.threshold_ns)
     stalls = stall_table(report.stall_meter, report.stalls)
     stalls.title = f"Stalls longer than {threshold} in {duration_text(report.watched_ns)}"
     if not report.stall_meter.realtime:
         stalls.caption = "taken without SCHED_FIFO: ordinary scheduling is among these stalls"
     return abilities, stalls
+
+
+def machine_line(report: MachineReport) -> str:
+    """Say in a line whether this machine can shape, by which back end, and what to look at."""
+    usable = [
+        check.name.removeprefix(BACK_END)
+        for check in report.checks
+        if check.name.startswith(BACK_END) and check.state == "good"
+    ]
+    if not usable:
+        (fifo,) = (check for check in report.checks if check.name == f"{BACK_END}fifo")
+        return f"✗ this machine cannot shape: {fifo.found}; {fifo.remedy}"
+    doubts = [check.name for check in report.checks if check.state == "limited"]
+    longest = max(row["longest_ns"] for row in stall_rows(report.stall_meter, report.stalls))
+    if longest >= WORTH_SAYING_NS:
+        doubts.append(f"stalls of up to {duration_text(round(longest, -5))}")
+    mark, about = ("!", f"; see {', '.join(doubts)}") if doubts else ("✓", "")
+    return f"{mark} this machine can shape, by {usable[0]}: `chainshaper demo` shows it{about}"
 
 
 def stall_rows(meter: StallMeterInfo, stalls: pl.DataFrame) -> list[dict[str, Any]]:

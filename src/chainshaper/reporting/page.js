@@ -300,6 +300,52 @@ function plotRows(id, { label, length, zoom, rows }) {
   });
 }
 
+/** The latency of every cycle of a recording as the sum of its hops' parts, hop upon hop. */
+function plotStacked({ recordings, opacity, n: suffix }, openCycle) {
+  const select = document.querySelector(`#stacked${suffix} select`), parts = Object.keys(opacity);
+  let data, sums, drawn;
+  const spec = { height: 320, zoom: "xy", paint, x: { label: "cycle" }, y: { label: "latency [ms]", unit: 1e6 } };
+
+  /** Where the cycle drawn n-th ends on the axis: at the next one, where not all are drawn. */
+  const end = (n) => data.cycle.length < data.of ? data.cycle[n + 1] ?? data.cycle[n] + 1 : data.cycle[n] + 1;
+
+  function paint(pen, view, box) {
+    const inView = [...data.cycle.keys()].filter((n) => end(n) > view.x[0] && data.cycle[n] < view.x[1]);
+    const below = data.cycle.map(() => 0), hits = new Set(data.disturbed), above = [];
+    for (const hop of data.hops) {
+      for (const part of parts) {
+        const d = inView.filter((n) => hop[part][n]).map((n) => {
+          const low = pen.y(below[n]).toFixed(1), high = pen.y(below[n] += hop[part][n]).toFixed(1);
+          return `M${pen.x(data.cycle[n]).toFixed(1)} ${low}V${high}H${pen.x(end(n)).toFixed(1)}V${low}z`;
+        }).join("");
+        pen.path(d, { fill: colour(hop.series), opacity: opacity[part], "shape-rendering": "crispEdges" });
+      }
+    }
+    for (const n of inView) {
+      const middle = (data.cycle[n] + end(n)) / 2;
+      if (sums[n] > view.y[1]) above.push(`M${pen.x(middle).toFixed(1)} ${box.top - 5}l4 7h-8z`);
+      pen.mark(middle, sums[n], () => `cycle ${data.cycle[n]}: ${ms(sums[n])} ms`
+        + (hits.has(n) ? ", disturbed by the machine" : "") + data.hops.map((hop) => `\n${hop.name}: `
+        + parts.filter((part) => hop[part][n]).map((part) => `${part} ${ms(hop[part][n])}`).join(", ")).join(""),
+      () => openCycle(select.selectedIndex, data.cycle[n]));
+    }
+    pen.path(above.join(""), { fill: "var(--ink)" });
+  }
+
+  function choose() {
+    data = recordings[select.selectedIndex].stacked;
+    sums = data.cycle.map((_, n) => data.hops.reduce((sum, hop) =>
+      parts.reduce((partial, part) => partial + hop[part][n], sum), 0));
+    spec.x.range = [data.cycle[0] ?? 0, (data.cycle.at(-1) ?? 0) + 1];
+    spec.y.range = [0, data.highest * 1.05];
+    return drawn ? drawn.reset() : (drawn = chart(`stacked${suffix}`, spec));
+  }
+
+  select.addEventListener("change", choose);
+  select.selectedIndex = recordings.length - 1;
+  choose();
+}
+
 /** Bars of the timeline by kind: cycles, callbacks, those without an end, gated, slots, stalls. */
 const FILLS = [OTHER, OTHER, OTHER, "url(#hatched)", "var(--series-1)", "var(--bad)"];
 
@@ -311,6 +357,7 @@ function plotTimeline({ recordings, n: suffix }) {
   const host = document.getElementById(`timeline${suffix}`), buttons = [...host.querySelectorAll("button")];
   const [select, number, about, body] = ["select", "input", ".about", "tbody"]
     .map((one) => host.querySelector(one));
+  const titles = [...host.querySelectorAll("thead th")].slice(1).map((head) => head.textContent);
   let timeline, cycle, drawn;
   const spec = { zoom: "x", pan: true, paint, step: (by) => step(by),
     x: { label: "since the cycle's start [ms]", unit: 1e6 }, y: { label: "", bare: true } };
@@ -361,8 +408,10 @@ function plotTimeline({ recordings, n: suffix }) {
     body.replaceChildren(...cycle.hops.map(([, take, start, publish], n) => {
       const row = document.createElement("tr"), sent = n ? cycle.hops[n - 1][3] : null;
       make(row, "th", timeline.hops[n]).scope = "row";
-      for (const time of [take, start, publish, sent === null ? null : start - sent,
-        publish === null ? null : publish - start]) make(row, "td", time === null ? "–" : ms(time));
+      [take, start, publish, sent === null ? null : start - sent,
+        publish === null ? null : publish - start].forEach((time, column) => {
+        make(row, "td", time === null ? "–" : ms(time)).dataset.title = titles[column];
+      });
       return row;
     }));
     return drawn ? drawn.reset() : (drawn = chart(`timeline${suffix}`, spec));
@@ -393,7 +442,9 @@ function plotTimeline({ recordings, n: suffix }) {
 }
 
 for (const page of pages) {
-  plotOverTime(page, plotTimeline(page));
+  const openCycle = plotTimeline(page);
+  plotOverTime(page, openCycle);
+  plotStacked(page, openCycle);
   for (const plot of [plotHistogram, plotDistribution]) plot(page);
   Object.entries(page.bars).forEach(([id, spec]) => plotRows(id, spec));
 }

@@ -14,7 +14,7 @@ policy forbids to run any script but the page's own, and to load anything.
 import base64
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -29,12 +29,20 @@ from chainshaper.planning import ChainPlan, Plan, dump_plan, publish_slots
 from chainshaper.planning.overruns import slots_of_latency
 from chainshaper.reporting import latency as of_chain
 from chainshaper.reporting import overviews
+from chainshaper.reporting.cycle_parts import OPACITY, drawn_cycles, stacked_cycles
+from chainshaper.reporting.graph_drawing import timed_graph_svg
 from chainshaper.reporting.tables import ResultTable, figures, ms, slots_ms, words
 from chainshaper.reporting.timeline import Timeline, timeline_data, timeline_of
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, escape, shown
 from chainshaper.values.files import new_file, write_whole
-from chainshaper.verify.measure import PARTS, Comparison, Measurement, hop_breakdown
+from chainshaper.verify.measure import (
+    PARTS,
+    Comparison,
+    Measurement,
+    hop_breakdown,
+    hop_names,
+)
 from chainshaper.verify.overruns import moves_in, moves_text, next_cycles, overruns_text
 
 ENDINGS = (".html", ".htm")
@@ -43,6 +51,9 @@ LISTED = 50
 
 POINTS = 4_000
 """Points of the chart over time, per recording, at most."""
+
+STACKED = 1_000
+"""Cycles of the chart that stacks their hops, per recording, at most."""
 
 BINS = 10_000
 """Fine bins over a recording's latencies at most."""
@@ -154,11 +165,12 @@ def _drawn(
 ) -> dict[str, Any]:
     """Collect the data of a chain's charts; ``n`` is the end of their ids, "" for the first."""
     suffix = f"-{number + 1}" if number else ""
-    recordings = [_recording_data(part, cycles) for part in parts]
+    series = _series(parts)
+    recordings = [_recording_data(part, cycles, series) for part in parts]
     points = [recording["points"] for recording in recordings]
     times = [time for drawn in points for time in (*drawn["time"][-1:], *drawn["incomplete"][-1:])]
     slots = enumerate(_plans_of(parts).values())
-    bars = {f"slots-{place}{suffix}": _slot_bars(plan) for place, plan in slots}
+    bars = {f"slots-{place}{suffix}": slot_bars(plan) for place, plan in slots}
     return {
         "n": suffix,
         "recordings": recordings,
@@ -167,6 +179,7 @@ def _drawn(
         ),
         "longest": max([1, *times]),
         "range": latency_range(recordings),
+        "opacity": OPACITY,
         "bars": {f"breakdown{suffix}": _hop_bars(parts), **bars},
     }
 
@@ -219,6 +232,7 @@ def _tables(parts: Sequence[_NamedMeasurement], suffix: str, several: bool) -> d
         "comparison": of_chain.comparison_table(compared, names).html(),
         "predictions": "\n".join(map(_prediction, parts)),
         "hops": "\n".join(hops),
+        "graphs": "\n".join(map(_graph, parts)),
         "overruns": "\n".join(_overruns(part) + _moves(part) for part in parts),
         "incomplete": incomplete.html() if incomplete.rows else _paragraph(none_incomplete),
         "stalls": "\n".join(map(_stalls, parts)),
@@ -243,7 +257,7 @@ def _beside_charts(
     parts: Sequence[_NamedMeasurement], data: Sequence[dict[str, Any]]
 ) -> dict[str, str]:
     """Make the HTML beside charts: legends, choices, and notes on what charts leave out."""
-    all_cycles, sample, points, cycles = [], [], "", ""
+    all_cycles, sample, points, stacked, cycles = [], [], "", "", ""
     for part, of_part in zip(parts, data, strict=True):
         total, drawn = of_part["points"]["of"], len(of_part["points"]["cycle"])
         number, here = of_part["timeline"]["of"], len(of_part["timeline"]["cycles"])
@@ -255,6 +269,12 @@ def _beside_charts(
                 f" Of {total} cycles of {part.name} {drawn} are drawn: of every stretch the"
                 " shortest and the longest, disturbed and not, and of the others every n-th."
             )
+        if (of_stacked := len(of_part["stacked"]["cycle"])) < total:
+            stacked += (
+                f" Of {total} cycles of {part.name} {of_stacked} are drawn, each as wide as those"
+                " left out behind it: of every stretch the shortest and the longest, and of the"
+                " others every n-th."
+            )
         if here < number:
             cycles += (
                 f" Of {number} cycles of {part.name} {here} are here: the longest, the shortest,"
@@ -263,19 +283,32 @@ def _beside_charts(
     return {
         "legend": _legend(all_cycles),
         "legend_of_sample": _legend(sample),
+        "legend_of_hops": _legend(_series(parts)),
         "fewer_points": escape(points),
+        "fewer_stacked": escape(stacked),
         "fewer_cycles": escape(cycles),
         "options": "".join(f"<option>{escape(part.name)}</option>" for part in parts),
         "waiting": WAITING,
     }
 
 
-def _legend(names: Sequence[str]) -> str:
+def _legend(names: Iterable[str]) -> str:
     items = (
         f'<span class="series-{number % 4}">{escape(name)}</span>'
         for number, name in enumerate(names)
     )
     return f'<div class="legend">{"".join(items)}</div>'
+
+
+def _graph(part: _NamedMeasurement) -> str:
+    """Make the HTML of the application's graph, with times of its edges and callbacks."""
+    analysis = part.measurement.analysis
+    drawing = timed_graph_svg(part.flow, analysis.graph, analysis.chain)
+    about = "Beside arrows: from publication to the start of the callback; beside callbacks: from"
+    about += " start to end; mean, and maximum, of all that was recorded. Thick: the chain."
+    title = f"The graph of {part.name}, with times"
+    content = f'{_paragraph(about)}<div class="drawing">{drawing}</div>'
+    return _details(title, content, unfolded=True)
 
 
 def _prediction(part: _NamedMeasurement) -> str:
@@ -380,7 +413,9 @@ def _details(summary: str, content: str, *, unfolded: bool = False) -> str:
     return f"<details{state}><summary>{escape(summary)}</summary>\n{content}\n</details>"
 
 
-def _recording_data(part: _NamedMeasurement, cycles: Sequence[int]) -> dict[str, Any]:
+def _recording_data(
+    part: _NamedMeasurement, cycles: Sequence[int], series: dict[str, int]
+) -> dict[str, Any]:
     """Collect the data of a recording's charts; its timeline has ``cycles`` at any rate."""
     measurement, plan = part.measurement, part.measurement.plan
     traversals = measurement.analysis.traversals
@@ -390,6 +425,7 @@ def _recording_data(part: _NamedMeasurement, cycles: Sequence[int]) -> dict[str,
         "slots": () if plan is None else slots_of_latency(plan),
         "points": latency_points(traversals, zero),
         "histogram": latency_histogram(traversals),
+        "stacked": _stacked(part, series),
         "timeline": timeline_data(measurement, part.timeline, cycles, zero),
     }
 
@@ -410,34 +446,64 @@ def latency_range(recordings: Sequence[dict[str, Any]]) -> tuple[float, float]:
     return 0 if low < 0.25 * high else low - air, high + air
 
 
-_OPACITY = {"communication": 0.35, "waiting": 0.15}
+def _series(parts: Sequence[_NamedMeasurement]) -> dict[str, int]:
+    """Number the hops of a chain in all recordings, by their names, for their colours."""
+    names = (name for part in parts for name in hop_names(part.measurement.analysis))
+    return {name: number for number, name in enumerate(dict.fromkeys(names))}
 
 
 def _hop_bars(parts: Sequence[_NamedMeasurement]) -> dict[str, Any]:
     """Collect the bars of mean communication, computation and waiting of each hop.
 
-    A row per recording. Communication is pale, computation full, waiting palest.
+    A row per hop of each recording, from the mean end of the hop before it.
     """
     rows, longest = [], 1.0
-    for series, recording in enumerate(parts):
-        bars, at = [], 0.0
-        breakdown = hop_breakdown(recording.measurement.analysis)
-        for number, hop in enumerate(breakdown.iter_rows(named=True)):
+    series = _series(parts)
+    for recording in parts:
+        analysis, at = recording.measurement.analysis, 0.0
+        breakdown = hop_breakdown(analysis).iter_rows(named=True)
+        for name, hop in zip(hop_names(analysis), breakdown, strict=True):
+            bars, begun = [], at
             for share_of in PARTS:
                 mean, share = (hop[f"{share_of}_ns"] or {}).get("mean"), hop[f"{share_of}_share"]
                 if not mean:
                     continue
-                opacity = _OPACITY.get(share_of, 0.8 if number % 2 else 1)
                 text = f"{hop['callback']} → {hop['topic']}\n{share_of} {ms(mean)} ms, {share:.1%}"
-                bars.append((at, at + mean, f"series-{series % 4}", opacity, text))
+                look = (f"series-{series[name] % 4}", OPACITY[share_of])
+                bars.append((at, at + mean, *look, text))
                 at += mean
-        rows.append((recording.name, bars))
+            of_recording = f"{recording.name}: " if len(parts) > 1 else ""
+            rows.append((f"{of_recording}{name}, {ms(at - begun)} ms", bars))
         longest = max(longest, at)
     label = "mean, from the start of the cycle"
     return {"label": label, "length": longest * 1.01, "rows": rows}
 
 
-def _slot_bars(plan: ChainPlan) -> dict[str, Any]:
+def _stacked(part: _NamedMeasurement, series: dict[str, int]) -> dict[str, Any]:
+    """Collect the data of the chart of cycles stacked by hop.
+
+    * ``of``: how many complete cycles there are.
+    * ``cycle``: lists of number; ``disturbed``: places in it of the disturbed cycles.
+    * ``hops``: of each the ``name`` and ``series``, and per part the times of all cycles (ns).
+    * ``highest``: the longest undisturbed latency (ns).
+    """
+    analysis = part.measurement.analysis
+    stacked = stacked_cycles(analysis, STACKED)
+    hops = [
+        {"name": name, "series": series[name]}
+        | {key: times[:, hop].tolist() for key, times in stacked.parts_ns.items()}
+        for hop, name in enumerate(hop_names(analysis))
+    ]
+    return {
+        "of": stacked.complete,
+        "cycle": stacked.cycles.tolist(),
+        "disturbed": np.flatnonzero(stacked.disturbed).tolist(),
+        "hops": hops,
+        "highest": analysis.undisturbed.max_ns or analysis.statistics.max_ns or 1,
+    }
+
+
+def slot_bars(plan: ChainPlan) -> dict[str, Any]:
     """Collect the bars of the servers' slots over one cycle, a row per server."""
     rows = []
     for server in plan.servers:
@@ -457,20 +523,11 @@ def latency_points(traversals: pl.DataFrame, zero: int, limit: int = POINTS) -> 
 
     Times count from ``zero``.
     """
-    drawn = complete = traversals.filter("complete")
-    if complete.height > limit:
-        stretches = max(1, limit // 8)  # two extremes each of two kinds: half of the points
-        stretch = (pl.int_range(pl.len()) * stretches // pl.len()).alias("stretch")
-        rows = complete.select("disturbed", "latency_ns", stretch).with_row_index("row")
-        latency, groups = pl.col("latency_ns"), rows.group_by("stretch", "disturbed")
-        places = (latency.arg_min(), latency.arg_max())
-        extremes = [groups.agg(pl.col("row").get(place))["row"] for place in places]
-        sample = pl.arange(0, complete.height, -(-2 * complete.height // limit), eager=True)
-        drawn = complete[pl.concat([*extremes, sample.cast(pl.UInt32)]).unique().sort()]
+    drawn = drawn_cycles(traversals, limit)
     broken = traversals.filter(~pl.col("complete"))["start"] - zero
     gaps = broken.gather_every(max(1, -(-len(broken) // limit)))
     return {
-        "of": complete.height,
+        "of": int(traversals["complete"].sum()),
         "cycle": drawn["traversal"].to_list(),
         "time": (drawn["start"] - zero).to_list(),
         "latency": drawn["latency_ns"].to_list(),

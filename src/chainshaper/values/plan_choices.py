@@ -4,7 +4,7 @@ This module imports nothing slow, as the planner does, so that `chainshaper plan
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple, TypeAlias
+from typing import Annotated, Literal, NamedTuple, TypeAlias, TypedDict
 
 from chainshaper.robot.gate import Anchor, IntoOpenSlot, Messages, Overrun
 
@@ -58,6 +58,8 @@ class Option(NamedTuple):
 
 
 BANDS, MARGIN = "Latency bands", "Margin"  # panels of the help
+SLOTS, GATE = "Slots and servers", "The gate of the output"
+"""Panels of the help; what has none stands in the first one, with the most common options."""
 
 
 # fmt: off
@@ -75,11 +77,13 @@ class Wishes:
     policy: Annotated[Policy, Option("Scheduling policy.")] = "shaped"
     publication: Annotated[Publication, Option(
         "By a shaping node; by the asynchronous publisher's own thread; or in-process: by a gate"
-        " that is loaded into the publisher's process, without another node.")] = "synchronous"
+        " that is loaded into the publisher's process, without another node.", GATE,
+    )] = "synchronous"
     publish_slot_ns: Annotated[int | None, Option(
-        "Length of the publish slot. Default: the longest publication measured, at least 1ms.")
-    ] = None
-    slot_start_ns: Annotated[int | None, Option("Where the slot of one-long-slot starts.")] = None
+        "Length of the publish slot. Default: the longest publication measured, at least 1ms.",
+        SLOTS)] = None
+    slot_start_ns: Annotated[int | None, Option(
+        "Where the slot of one-long-slot starts.", SLOTS)] = None
     epsilon_ns: Annotated[int | None, Option(
         "A given margin behind the longest undisturbed latency. Default: 1ms behind the latency"
         " that all cycles but 1 % stay below.", MARGIN)] = None
@@ -93,7 +97,7 @@ class Wishes:
         "Leave out cycles that the machine disturbed: for one that does not stall.", MARGIN,
     )] = False
     bands: Annotated[int | Literal["auto"], Option(
-        "Number of bands; auto: as many as are worth it.", BANDS, "N|auto")] = 1
+        "Number of latency bands; auto: as many as are worth it.", metavar="N|auto")] = 1
     solver: Annotated[Solver, Option("Band solver.", BANDS)] = "exact"
     grid_ns: Annotated[int, Option("Slots end at multiples of this.", BANDS)] = 1_000
     max_gap_ns: Annotated[int | None, Option(
@@ -105,7 +109,7 @@ class Wishes:
         "Accept no average above this.", BANDS)] = None
     least_gain: Annotated[float, Option(
         "With --bands auto: what another band must take off the average.", BANDS, "SHARE")] = 0.02
-    seed: Annotated[int, Option("For pso, random and the derived margin.", least=0)] = 0
+    seed: Annotated[int, Option("For pso, random and the derived margin.", BANDS, least=0)] = 0
     cores: Annotated[tuple[int, ...] | None, Option(
         "Distribute the executors, or the stages of a pipeline, over these cores, such as 0,1:"
         " branches that run at the same time, and chains whose slots would collide, get a core of"
@@ -114,43 +118,82 @@ class Wishes:
     first_slot_ns: Annotated[int | None, Option(
         "Reserve this long for the chain's first node alone.", "More of the graph")] = None
     anchor: Annotated[Anchor, Option(
-        "What slots count from: the message's stamp, or the cycle.")] = "stamp"
+        "What slots count from: the message's stamp, or the cycle.", SLOTS)] = "stamp"
     overrun: Annotated[Overrun | None, Option(
         "An output that missed its slot: at once; or in slots only: wait for the next, or"
-        " discard. Default: publish.")] = None
+        " discard. Default: publish.", GATE)] = None
     into_open_slot: Annotated[IntoOpenSlot, Option(
         "An output that comes when its slot is open: at once; or in the next slot, so that a band"
         " has no jitter.", BANDS)] = "at-once"
     messages: Annotated[Messages, Option(
-        "Which of several outputs in one cycle leave.")] = "all-in-order"
+        "Which of several outputs in one cycle leave.", GATE)] = "all-in-order"
     depth: Annotated[int | None, Option(
         "How many outputs may wait in the gate. Default: as many as the history of its"
-        " publisher has room for, 10 at least.", least=1)] = None
+        " publisher has room for, 10 at least.", GATE, least=1)] = None
     shaping_thread: Annotated[ShapingThread, Option(
         "The shaping node's thread: its gate alone times it; or back ends keep it in its server's"
-        " slots as well.")] = "free"
+        " slots as well.", GATE)] = "free"
     fallback: Annotated[Fallback, Option(
         "While the shaping node is not there: outputs go around it, or none is published."
-        " Default: bypass, or what the plan says.")] = "bypass"
+        " Default: bypass, or what the plan says.", GATE)] = "bypass"
     spin_ns: Annotated[int, Option(
-        "How long the gate watches the clock before its slot.")] = 1_000_000
+        "How long the gate watches the clock before its slot.", GATE)] = 1_000_000
     pause_ns: Annotated[int | None, Option(
         "How long the gate rests after publishing. Default: 2ms, a twentieth of the cycle at"
-        " most.")] = None
+        " most.", GATE)] = None
     delivery_ns: Annotated[int | None, Option(
         "Hand the output to its subscribers' callbacks at this constant time behind its"
         " publication, such as 500us, whatever the transport takes; their executors wait"
-        " meanwhile. Default: as it comes.", least=1)] = None
+        " meanwhile. Default: as it comes.", GATE, least=1)] = None
     equal_priorities: Annotated[EqualPriorities, Option(
         "apart: slots of servers of one priority on a core never overlap; round-robin: all servers"
-        " share one priority and alternate (eq. 3).")] = "apart"
+        " share one priority and alternate (eq. 3).", SLOTS)] = "apart"
     slot_ends: Annotated[SlotEnds, Option(
         "A server whose slot ends while a callback runs: it stays open until that is done; or it"
         " closes, as the paper's time-driven servers do, and the callback goes on in its next"
-        " slot.")] = "open-until-done"
+        " slot.", SLOTS)] = "open-until-done"
     best_effort: Annotated[tuple[str, ...], Option(
         "A node outside the chain that runs when none of its servers does, in a server that is"
         " open all the time (may be repeated).", "More of the graph", "NODE")] = ()
     with_receivers: Annotated[bool, Option(
         "Give nodes that subscribe to the shaped output SCHED_FIFO, in the place that the plan"
-        " has for them, while it is in force.", flag="--receivers/--no-receivers")] = True
+        " has for them, while it is in force.", GATE, flag="--receivers/--no-receivers")] = True
+# fmt: on
+
+
+class WishKeywords(TypedDict, total=False):
+    """The fields of :class:`Wishes` as keyword arguments, for type checkers and editors."""
+
+    policy: Policy
+    publication: Publication
+    publish_slot_ns: int | None
+    slot_start_ns: int | None
+    epsilon_ns: int | None
+    percentile: float | None
+    overrun_probability: float | None
+    ideal_machine: bool
+    bands: int | Literal["auto"]
+    solver: Solver
+    grid_ns: int
+    max_gap_ns: int | None
+    max_share: float | None
+    minimise: Goal
+    mean_at_most_ns: int | None
+    least_gain: float
+    seed: int
+    cores: tuple[int, ...] | None
+    first_slot_ns: int | None
+    anchor: Anchor
+    overrun: Overrun | None
+    into_open_slot: IntoOpenSlot
+    messages: Messages
+    depth: int | None
+    shaping_thread: ShapingThread
+    fallback: Fallback
+    spin_ns: int
+    pause_ns: int | None
+    delivery_ns: int | None
+    equal_priorities: EqualPriorities
+    slot_ends: SlotEnds
+    best_effort: tuple[str, ...]
+    with_receivers: bool

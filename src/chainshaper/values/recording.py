@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 import polars as pl
 from pydantic import BaseModel, Field
 
-from chainshaper.values.errors import InputError, OperationError, storable
+from chainshaper.values.errors import InputError, OperationError, shown, storable
 from chainshaper.values.events import (
     EventTables,
     as_table,
@@ -36,6 +36,7 @@ from chainshaper.values.files import (
     rename_output,
     write_whole,
 )
+from chainshaper.values.notebook import notebook_html
 from chainshaper.values.parquet import PackedColumns, is_packable, packed
 from chainshaper.values.yaml_file import wrong_values_refused
 
@@ -142,6 +143,17 @@ class Recording:
     path: Path
     info: RecordingInfo
     events: EventTables = field(repr=False)  # each is read at its first use
+
+    def __repr__(self) -> str:
+        info = self.info
+        about = [f"{info.source} on {info.host}"]
+        about += [f"ROS 2 {info.distribution}"] if info.distribution else []
+        about += [f"chain {info.chain}"] if info.chain else []
+        about += ["a plan was in force"] if info.plan is not None else []
+        about += [lost_text(info.lost)] if any(info.lost.values()) else []
+        return shown(f"Recording({self.path}: {', '.join(about)})")
+
+    _repr_html_ = notebook_html
 
 
 class _TablesOnDisk(Mapping[str, pl.DataFrame]):

@@ -13,6 +13,7 @@ parts:
 Over a complete traversal the three add up to the latency, so their mean shares add up to 1.
 """
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,8 +35,9 @@ from chainshaper.planning.plan import plan_of_chain
 from chainshaper.planning.plan_file import plan_in
 from chainshaper.sources import open_source
 from chainshaper.values import events
-from chainshaper.values.durations import duration_text
-from chainshaper.values.errors import InputError
+from chainshaper.values.durations import duration_text, milliseconds
+from chainshaper.values.errors import InputError, shown
+from chainshaper.values.notebook import notebook_html
 from chainshaper.values.recording import Recording
 from chainshaper.verify.overruns import (
     OverrunOutcome,
@@ -84,6 +86,12 @@ class Measurement:
     prediction: JudgedPrediction | None  # the plan's, beside this measurement
     left_out: LeftOut  # of the recording
 
+    def __repr__(self) -> str:
+        about = f"{self.analysis.chain.spec}: {self.analysis.statistics.text}"
+        return shown(f"Measurement({self.recording.path.name}: {about})")
+
+    _repr_html_ = notebook_html
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -91,6 +99,16 @@ class Comparison:
 
     chain: str
     measurements: tuple[Measurement, ...]
+
+    def __repr__(self) -> str:
+        jitters = []
+        for measurement in self.measurements:
+            jitter_ns = measurement.analysis.undisturbed.jitter_ns
+            jitter = "no cycle" if jitter_ns is None else f"{milliseconds(jitter_ns)} ms"
+            jitters.append(f"{jitter} ({measurement.recording.path.name})")
+        return shown(f"Comparison({self.chain}: undisturbed jitter {' → '.join(jitters)})")
+
+    _repr_html_ = notebook_html
 
     @property
     def remark(self) -> str | None:
@@ -356,6 +374,31 @@ def hop_breakdown(analysis: LatencyAnalysis) -> pl.DataFrame:
         *times,
         *((mean / latency).alias(f"{part}_share") for part, mean in zip(PARTS, means, strict=True)),
     )
+
+
+def cycle_parts(analysis: LatencyAnalysis) -> pl.DataFrame:
+    """Make a frame of the parts of each hop in each complete traversal; they sum to the latency.
+
+    Sorted by traversal and hop:
+
+    * ``traversal``, ``hop`` (from 0).
+    * ``communication_ns``, ``computation_ns``, ``waiting_ns``: 0 where there is no such part.
+    """
+    complete = analysis.traversals.filter("complete")
+    parts = analysis.hops.join(complete, on="traversal", how="semi").select(
+        "traversal", "hop", *(pl.col(f"{part}_ns").fill_null(0) for part in PARTS)
+    )
+    return parts.sort("traversal", "hop")
+
+
+def hop_names(analysis: LatencyAnalysis) -> list[str]:
+    """Name each hop by its node, and its topic where the chain meets the node several times."""
+    path = analysis.graph.path(analysis.chain)
+    met = Counter(callback.node for callback in path)
+    return [
+        callback.node if met[callback.node] == 1 else f"{callback.node} → {topic}"
+        for callback, topic in zip(path, analysis.chain.topics, strict=True)
+    ]
 
 
 def part_shares(frame: pl.DataFrame) -> dict[str, float | None]:
