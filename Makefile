@@ -12,10 +12,15 @@ export CMAKE_CXX_COMPILER_LAUNCHER = $(ccache)
 export CCACHE_DIR = $(CURDIR)/build/ccache
 endif
 
-.PHONY: demo test test-untimed test-timed test-waiting test-building test-kernel core-tests lint benchmark experiments docs clean
+.PHONY: demo demo-ros ros2-wheels test test-untimed test-timed test-waiting test-building test-kernel core-tests lint benchmark experiments docs clean
 
 demo: .venv/.ready
 	.venv/bin/chainshaper demo
+
+# The same as real ROS 2 nodes, on a machine without ROS 2: scripts/ros2-wheels brings one.
+demo-ros: .venv/.ready
+	scripts/ros2-wheels
+	. .venv-ros/setup.sh && .venv/bin/chainshaper demo --ros
 
 # Tests that need the machine's cores for themselves, and beside them those that mostly wait for
 # tracers and other programs. What computes and compiles takes only what these leave (`nice -n 19`),
@@ -25,7 +30,7 @@ demo: .venv/.ready
 test:
 	scripts/test-tools
 	rm -rf build/tried
-	$(MAKE) .venv/.ready-dev
+	$(MAKE) --jobs=2 .venv/.ready-dev ros2-wheels
 	$(MAKE) --jobs=4 --output-sync=line \
 		test-timed test-waiting test-untimed look-and-compile; \
 		code=$$?; scripts/run-tests --tried-twice; exit $$code
@@ -33,6 +38,10 @@ test:
 .PHONY: look-and-compile
 look-and-compile:
 	$(MAKE) --jobs=1 --keep-going lint core-tests test-building
+
+# Tests of a real ROS 2 run on it where no other one is; without it they skip (tests/helpers/ros2.py).
+ros2-wheels:
+	-[ "$$TEST_TOOLS" = leave ] || scripts/ros2-wheels
 
 test-untimed: .venv/.ready-dev
 	scripts/run-tests untimed "not timed and not waiting and not building" nice -n 19

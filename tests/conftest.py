@@ -13,7 +13,7 @@ import pytest
 from calm_runs import calm_run
 from cores import cores
 from hypothesis import settings
-from ros2 import require_lttng_of_ros2, ros2_environment
+from ros2 import require_lttng_of_ros2, require_packages, ros2_environment
 from small_chain import EXECUTOR_CORE, small_chain, small_chain_plan, small_chain_text
 
 from chainshaper import run_application, shape_application, simulate
@@ -42,6 +42,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         live = LIVE_RUNS & set(getattr(item, "fixturenames", ()))
         if live or item.get_closest_marker("ros2"):
             item.add_marker("timed")
+
+
+@pytest.hookimpl(tryfirst=True)  # before its fixtures are made
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip a test of a real ROS 2 where there is none, or it lacks a package that a mark names."""
+    for mark in item.iter_markers("ros2"):
+        require_packages(*mark.args)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -39,7 +39,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "recording"
 
 
-@pytest.mark.ros2
+@pytest.mark.ros2("rclcpp_action")
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("node", ["client", "other"])
 def test_every_call_is_followed_to_the_client_that_made_it(recording: Path, node: str) -> None:
@@ -67,7 +67,7 @@ def test_every_call_is_followed_to_the_client_that_made_it(recording: Path, node
     assert hops.min() >= 2_000_000, "the server computes for that at least"
 
 
-@pytest.mark.ros2
+@pytest.mark.ros2("rclcpp_action")
 @pytest.mark.timeout(300)
 def test_an_actions_feedback_and_result_are_followed(recording: Path) -> None:
     source, folder = cs.open_source(recording), recording.parent
@@ -91,7 +91,7 @@ def test_an_actions_feedback_and_result_are_followed(recording: Path) -> None:
         assert analysis.traversals["start"][0] <= printed(asked, "goal")[0, 0]
 
 
-@pytest.mark.ros2
+@pytest.mark.ros2("rclcpp_action")
 @pytest.mark.timeout(300)
 def test_the_commands_show_services_and_clients(recording: Path) -> None:
     callbacks = {
@@ -105,7 +105,7 @@ def test_the_commands_show_services_and_clients(recording: Path) -> None:
     assert "/add:response" in shown.out
 
 
-@pytest.mark.ros2
+@pytest.mark.ros2("rclcpp_action")
 @pytest.mark.timeout(300)
 @pytest.mark.usefixtures("lttng_of_ros2")
 def test_lttng_has_no_calls_before_kilted_and_latency_says_so(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from chainshaper.enforcement.node_threads import IN_ORDER
 from chainshaper.planning import load_plan
 from chainshaper.planning.chain_plan import Thread
 
-pytestmark = [pytest.mark.ros2, pytest.mark.timeout(300), needs_fifo, needs_cgroups]
+pytestmark = [pytest.mark.ros2("rclcpp"), pytest.mark.timeout(300), needs_fifo, needs_cgroups]
 
 SOURCE = Path(__file__).with_name("callback_groups.cpp")
 LIBRARIES = ("rclcpp", "rcl", "rmw", "rcutils", "tracetools", "std_msgs__rosidl_typesupport_cpp")

@@ -11,7 +11,7 @@ from on_ros import MIDDLEWARES, ros_in_turns
 from chainshaper.linux.scheduling import may_use_fifo
 
 
-@pytest.mark.ros2
+@pytest.mark.ros2("rclcpp", "launch_ros")
 @pytest.mark.usefixtures("in_ros2")
 @pytest.mark.timeout(600)
 @pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here")

@@ -22,7 +22,7 @@ from chainshaper.planning import ChainPlan, Plan, Profile, plan_chain
 from chainshaper.splicing.spliced_launch import NODES
 from chainshaper.values import events
 
-pytestmark = [pytest.mark.ros2, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.ros2("rclcpp_components", "launch_ros"), pytest.mark.timeout(900)]
 
 HERE = Path(__file__).parent
 MS = 1_000_000

@@ -67,7 +67,7 @@ def test_a_machine_too_busy_to_plan_for_gets_a_second_chance_and_then_an_answer(
     assert shown.longer
     first, both = planned_from
     assert both > 1.5 * first
-    monkeypatch.setattr(demonstration, "_often_disturbed", lambda _: False)
+    monkeypatch.setattr(demonstration, "_at_the_mercy_of_others", lambda _: False)
     with pytest.raises(InputError, match="do not fit"):
         run_demo(tmp_path / "calm", application=application_file, cycles=20)
     assert cs.measure_latency(tmp_path / "calm" / "before").analysis.statistics.count >= 15

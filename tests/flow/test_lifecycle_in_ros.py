@@ -40,7 +40,7 @@ def before(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield folder
 
 
-@pytest.mark.ros2
+@pytest.mark.ros2("rclcpp_lifecycle", "launch_ros")
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(
     ("where", "changes"),

@@ -5,7 +5,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -245,12 +244,9 @@ def test_a_full_disk_is_named(node: Path, full_disk: Path) -> None:
     assert "rec" not in files_in(full_disk)
 
 
-@pytest.mark.ros2
+@pytest.mark.ros2("demo_nodes_cpp", "ros2run")
 @pytest.mark.usefixtures("in_ros2")
 def test_real_nodes_are_recorded_with_types_and_qos(tmp_path: Path) -> None:
-    package = ["ros2", "pkg", "prefix", "demo_nodes_cpp"]
-    if subprocess.run(package, capture_output=True, check=False).returncode:
-        pytest.skip("the package demo_nodes_cpp is not installed in this ROS 2")
     path = tmp_path / "rec"
     nodes = "ros2 run demo_nodes_cpp talker & ros2 run demo_nodes_cpp listener"
     json_of_recording("-o", path, "--duration", "8s", "--", "sh", "-c", nodes)

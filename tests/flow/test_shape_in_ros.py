@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import polars as pl
 import pytest
-from ros2 import require_lttng_of_ros2, ros2_environment
+from ros2 import require_lttng_of_ros2, require_packages, ros2_environment
 
 from chainshaper import (
     load_application,
@@ -26,7 +26,7 @@ from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.planning.overruns import cycles_until_output
 
 pytestmark = [
-    pytest.mark.ros2,
+    pytest.mark.ros2("rclcpp", "launch_ros"),
     pytest.mark.timeout(900),
     pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here"),
     pytest.mark.skipif(len(available_cores()) < 2, reason="two cores are needed"),
@@ -321,9 +321,8 @@ def test_receivers_get_the_output_at_a_constant_time_behind_it(
 
 def _driving(attempt: Callable[..., Attempt], folder: Path, topic: str, duration: str) -> Attempt:
     """Shape a chain on Fast DDS, whose last node publishes one topic asynchronously."""
-    prefixes, rmw = ros2_environment()["AMENT_PREFIX_PATH"].split(":"), "rmw_fastrtps_cpp"
-    if not any(Path(prefix, "share", rmw).is_dir() for prefix in prefixes):
-        pytest.skip(f"the package {rmw} is not installed in this ROS 2")
+    rmw = "rmw_fastrtps_cpp"
+    require_packages(rmw)
     profiles = folder / "profiles.xml"
     profiles.write_text(PROFILES.format(topic=topic))
     asked = {"FASTRTPS_DEFAULT_PROFILES_FILE": str(profiles), "RMW_FASTRTPS_USE_QOS_FROM_XML": "1"}

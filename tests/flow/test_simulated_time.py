@@ -127,7 +127,7 @@ wait; wait
 """
 
 
-@pytest.mark.ros2
+@pytest.mark.ros2("rclcpp_lifecycle", "ros2lifecycle")
 @pytest.mark.usefixtures("in_ros2")
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(

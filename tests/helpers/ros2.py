@@ -1,4 +1,8 @@
-"""ROS 2 for tests marked `ros2`: sourced already, by `$ROS2_SETUP`, or from below /opt/ros."""
+"""ROS 2 for tests marked `ros2`: sourced already, by `$ROS2_SETUP`, from below /opt/ros, or wheels.
+
+The wheels are those that `scripts/ros2-wheels` brings. They have `rclpy` and messages; a test that
+needs more names the packages: `@pytest.mark.ros2("rclcpp", "launch_ros")`.
+"""
 
 import functools
 import os
@@ -9,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+_WHEELS = Path(__file__).parents[2] / ".venv-ros/setup.sh"
 _LISTED_BY_LTTNG = """
 if [ "$(id -u)" -eq 0 ]; then
     mkdir -p /var/run/lttng && mount -t tmpfs tmpfs /var/run/lttng || exit
@@ -30,8 +35,19 @@ def ros2_environment() -> dict[str, str]:
     """
     environment = _environment()
     if environment is None:
-        pytest.skip("no ROS 2: source its setup.bash, or name it in ROS2_SETUP")
+        pytest.skip(
+            "no ROS 2: source its setup.bash, name it in ROS2_SETUP, or scripts/ros2-wheels"
+        )
     return {**environment, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+
+
+def require_packages(*names: str) -> None:
+    """Skip a test where ROS 2 lacks one of these packages."""
+    prefixes = ros2_environment().get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    for name in names:
+        place = f"share/ament_index/resource_index/packages/{name}"
+        if not any(Path(prefix, place).is_file() for prefix in prefixes):
+            pytest.skip(f"the package {name} is not installed in this ROS 2")
 
 
 def require_lttng_of_ros2() -> None:
@@ -72,6 +88,7 @@ def _why_not_traced() -> str | None:
 def _environment() -> dict[str, str] | None:
     candidates = [os.environ["ROS2_SETUP"]] if "ROS2_SETUP" in os.environ else []
     candidates += [str(path) for path in sorted(Path("/opt/ros").glob("*/setup.bash"))[::-1]]
+    candidates += [str(_WHEELS)] if _WHEELS.is_file() else []
     environments = [dict(os.environ)] if "AMENT_PREFIX_PATH" in os.environ else []
     for setup in candidates:
         command = ["bash", "-c", 'source "$1" >&2 && env -0', "bash", setup]
@@ -79,7 +96,7 @@ def _environment() -> dict[str, str] | None:
         pairs = [line.split("=", 1) for line in sourced.stdout.decode().split("\0") if "=" in line]
         environments.append(dict(pairs))
     for environment in environments:
-        command = ["python3", "-c", "import launch_ros.actions, rclpy"]
+        command = ["python3", "-c", "import rclpy"]
         # `env` looks it up on that PATH, not on ours
         run = subprocess.run(["env", *command], env=environment, capture_output=True, check=False)
         if run.returncode == 0:

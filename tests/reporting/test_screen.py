@@ -3,6 +3,7 @@
 import io
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +11,11 @@ from rich.console import Console
 from rich.text import Text
 
 from chainshaper.analysis import LatencyStatistics
+from chainshaper.reporting.latency import write_comparison_json
 from chainshaper.reporting.screen import (
     WIDTH,
     TimeAxis,
+    compared_before,
     comparison_lines,
     figure_rows,
     unplanned_lines,
@@ -121,6 +124,21 @@ def test_an_axis_has_round_numbers_and_room_for_all(
     assert len(shown) >= 2
     drawn = axis.histogram(latencies)
     assert sum(character != " " for character in drawn) == 2
+
+
+def test_figures_of_an_earlier_comparison_stand_beside(
+    comparison: Comparison, tmp_path: Path
+) -> None:
+    file = write_comparison_json(comparison, tmp_path)
+    shown = [str(line) for line in compared_before(file)]
+    first = comparison.measurements[0].analysis.undisturbed
+    assert first.jitter_ns is not None
+    assert f"jitter {first.jitter_ns / 1e6:.1f} ms → " in shown[0]
+    assert shown[1].strip() == f"({tmp_path})"
+    for text in ("", "{}", '{"recordings": []}', '{"recordings": [{}, {}]}'):
+        file.write_text(text)
+        assert not compared_before(file)
+    assert not compared_before(tmp_path / "nothing")
 
 
 def test_the_histogram_is_as_high_as_outputs_are_many() -> None:

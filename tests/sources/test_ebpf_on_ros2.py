@@ -18,9 +18,7 @@ def nodes(in_ros2: None) -> Iterator[list[int]]:
     """Processes of a talker and a listener."""
     skip_without_bpftrace()
     package = ["ros2", "pkg", "prefix", PACKAGE]
-    prefix = subprocess.run(package, capture_output=True, text=True, check=False)
-    if prefix.returncode:
-        pytest.skip(f"the package {PACKAGE} is not installed in this ROS 2")
+    prefix = subprocess.run(package, capture_output=True, text=True, check=True)
     folder = Path(prefix.stdout.strip()) / "lib" / PACKAGE
     running = [
         subprocess.Popen(
@@ -37,7 +35,7 @@ def nodes(in_ros2: None) -> Iterator[list[int]]:
         process.wait(20)
 
 
-@pytest.mark.ros2
+@pytest.mark.ros2("demo_nodes_cpp", "ros2pkg")
 def test_running_nodes_get_their_names_topics_and_callbacks(
     nodes: list[int], tmp_path: Path
 ) -> None:

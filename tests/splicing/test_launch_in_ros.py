@@ -16,12 +16,12 @@ from typing import Any
 import pytest
 from command_line import called, json_of, refused
 from launch_cases import CASES, PACKAGES, ROBOTS, Case, plan_for
-from ros2 import ros2_environment
+from ros2 import require_packages, ros2_environment
 
 from chainshaper import ThrottledInput, splice_launch_files, splice_throttlers
 from chainshaper.planning import Plan, save_plan
 
-pytestmark = [pytest.mark.ros2, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.ros2("launch_ros"), pytest.mark.timeout(300)]
 
 ASKED = Path(__file__).parent / "launched_nodes.py"
 LAUNCHED = Path(__file__).parent / "launched_for_a_while.py"
@@ -241,11 +241,10 @@ def launched(tmp_path: Path, environment: dict[str, str]) -> Iterator[Any]:
     ],
 )
 def test_a_launch_that_redirects_what_is_meant_goes_on(
-    launched: Any, environment: dict[str, str], actions: str, publisher: str
+    launched: Any, actions: str, publisher: str
 ) -> None:
-    prefixes = environment["AMENT_PREFIX_PATH"].split(os.pathsep)
-    if "TALKER" in actions and not any((Path(p) / "share/composition").is_dir() for p in prefixes):
-        pytest.skip("the package composition is not installed in this ROS 2")
+    if "TALKER" in actions:
+        require_packages("composition")
     code, said = launched(actions, publisher)
     assert f"/pose of {publisher} is redirected: /pose_tmp" in said, said
     assert code == 0, said

@@ -41,6 +41,10 @@ TYPE = "geometry_msgs/msg/PointStamped"
 COUNTERPART = Path(__file__).parent / "ros_counterpart.py"
 COUNT = 30
 
+GENERIC, TYPED = (
+    pytest.param(kind, marks=pytest.mark.ros2("rclcpp")) for kind in ("generic", "typed")
+)
+
 
 @pytest.fixture(autouse=True, scope="module")
 def in_ros_environment() -> Iterator[None]:
@@ -119,7 +123,7 @@ def rclpy_has_source_timestamps() -> bool:
 
 
 @pytest.mark.parametrize("quality", ["latched", "best_effort"])
-@pytest.mark.parametrize("kind", ["python", "generic", "typed"])
+@pytest.mark.parametrize("kind", ["python", GENERIC, TYPED])
 def test_messages_come_back_in_the_slot_of_their_mode(
     tmp_path: Path, plan: ChainPlan, kind: NodeKind, quality: str, place: Path | None
 ) -> None:
@@ -156,7 +160,7 @@ def test_messages_come_back_in_the_slot_of_their_mode(
 
 
 @pytest.mark.parametrize("messages", ["all-in-order", "newest"])
-@pytest.mark.parametrize("kind", ["python", "generic", "typed"])
+@pytest.mark.parametrize("kind", ["python", GENERIC, TYPED])
 def test_of_more_than_one_a_cycle_none_is_lost_that_is_not_counted(
     tmp_path: Path, plan: ChainPlan, kind: NodeKind, messages: str, place: Path | None
 ) -> None:
@@ -175,7 +179,7 @@ def test_of_more_than_one_a_cycle_none_is_lost_that_is_not_counted(
     assert reasons <= ({"replaced", "overflowed"} if messages == "newest" else {"overflowed"})
 
 
-@pytest.mark.parametrize("kind", ["python", "generic"])
+@pytest.mark.parametrize("kind", ["python", GENERIC])
 def test_a_running_node_is_told_where_cycles_begin(
     tmp_path: Path, plan: ChainPlan, kind: NodeKind, place: Path | None
 ) -> None:
@@ -194,7 +198,7 @@ def test_a_running_node_is_told_where_cycles_begin(
     assert set(origins % plan.cycle_ns) <= {0, phase}
 
 
-@pytest.mark.parametrize("kind", ["python", "generic"])
+@pytest.mark.parametrize("kind", ["python", GENERIC])
 def test_it_stops_while_it_waits_for_its_input(
     tmp_path: Path, plan: ChainPlan, kind: NodeKind, place: Path | None
 ) -> None:
@@ -205,7 +209,7 @@ def test_it_stops_while_it_waits_for_its_input(
                 break
 
 
-@pytest.mark.parametrize("kind", ["typed"])
+@pytest.mark.parametrize("kind", [TYPED])
 def test_a_typed_node_refuses_another_type(
     tmp_path: Path, plan: ChainPlan, kind: NodeKind, place: Path | None
 ) -> None:
@@ -222,7 +226,7 @@ def test_a_typed_node_refuses_another_type(
 
 
 @pytest.mark.parametrize("rule", RULES)
-@pytest.mark.parametrize("kind", ["python", "generic"])
+@pytest.mark.parametrize("kind", ["python", GENERIC])
 def test_the_throttler_publishes_once_a_period(
     tmp_path: Path, kind: NodeKind, place: Path | None, rule: Rule
 ) -> None:

@@ -30,7 +30,7 @@ from chainshaper.splicing.shaped_outputs import ShapedOutput, find_outputs
 from chainshaper.splicing.spliced_launch import NODES
 from chainshaper.values.plan_choices import NodeLanguage
 
-pytestmark = [pytest.mark.ros2, pytest.mark.timeout(1200)]
+pytestmark = [pytest.mark.ros2("launch_ros"), pytest.mark.timeout(1200)]
 
 OUTPUT = Path(__file__).parent / "ros_output.py"
 KILLS = int(os.environ.get("CHAINSHAPER_KILLS", "3"))

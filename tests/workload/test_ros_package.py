@@ -269,7 +269,7 @@ nodes:
 """
 
 
-@pytest.mark.ros2
+@pytest.mark.ros2("rclcpp", "launch_ros")
 @pytest.mark.timeout(400)
 @pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here")
 def test_a_built_package_runs_as_the_live_workload_does(tmp_path: Path) -> None:

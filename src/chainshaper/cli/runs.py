@@ -60,6 +60,11 @@ def demo(
     realtime: bool | None = opt.REALTIME,
     *,
     request: "cs.PlanRequest",
+    ros: bool = opt.option(
+        "--ros",
+        "As nodes of the ROS 2 that is sourced, shaped in the publisher's process and by a node.",
+        False,
+    ),
     verbose: bool = opt.option("--verbose", "Print all tables, too, and every note.", False),
     json: bool = opt.JSON,
 ) -> None:
@@ -71,7 +76,8 @@ def demo(
     from chainshaper.flow.demonstration import run_demo
     from chainshaper.reporting.latency import comparison_json
 
-    folder = output or Path(f"chainshaper-demo-{datetime.now():%Y%m%d-%H%M%S}")
+    kind = "demo-ros" if ros else "demo"
+    folder = output or Path(f"chainshaper-{kind}-{datetime.now():%Y%m%d-%H%M%S}")
     with out.progress("demo") as report:
         shown = run_demo(
             folder,
@@ -79,6 +85,7 @@ def demo(
             cycles=cycles,
             request=request,
             realtime=realtime,
+            in_ros=ros,
             command=sys.argv,
             progress=report,
         )
@@ -95,24 +102,30 @@ def demo(
 def _show_demonstration(shown: "Demonstration", *, verbose: bool) -> None:
     """Show what a demonstration has shown on one screen; ``verbose`` shows all tables."""
     from chainshaper.reporting.overviews import callback_table, plan_table
-    from chainshaper.reporting.screen import comparison_lines, unplanned_lines
+    from chainshaper.reporting.screen import compared_before, comparison_lines, unplanned_lines
 
     before, folder = shown.before.recording, shown.folder
     if verbose:
         flow = cs.data_flow(before.events, before.info.clock_offset_ns)
         out.show(callback_table(cs.callback_statistics(flow)))
-        if shown.comparison is not None:
-            plan = cs.load_plan(folder / "plan.yaml")
-            out.show(*map(plan_table, plan.chains), *comparison_tables(shown.comparison))
+        for plan in shown.plans:
+            out.show(*map(plan_table, plan.chains))
             out.warn(plan)
+        if shown.comparison is not None:
+            out.show(*comparison_tables(shown.comparison))
         out.notes(before.info.notes)
     if shown.comparison is None:
         out.show(*unplanned_lines(shown.before, shown.unplanned or ""))
-    else:
-        out.show(*comparison_lines(shown.comparison))
+    for number, (title, comparison) in enumerate(shown.shaped.items()):
+        if len(shown.shaped) > 1:
+            out.show_line(f"{'' if number == 0 else chr(10)}  ROS 2 nodes, {title}")
+        out.show(*comparison_lines(comparison))
     if shown.longer:
         out.show_line("  ! Stalls hit more than a third of the cycles: it measured for longer.")
     out.show_line("")
+    earlier = sorted(Path().glob("chainshaper-demo-2*/comparison.json"))[-1:]
+    if len(shown.shaped) > 1 and earlier:
+        out.show(*compared_before(earlier[0]))
     look = "report.html" if shown.comparison is not None else "before"
     out.show_line(f"  Look        {folder / look}")
     out.show_line(

@@ -1,15 +1,19 @@
 """The demonstration: an application is measured, planned for, shaped, measured again, compared.
 
 Runs without and with the plan take turns, so that both meet the same machine: what it does to them
-can be compared. Where it stands still often, they go on for longer.
+can be compared. Where it stands still often, they go on for longer. As ROS 2 nodes the application
+is shaped in two ways, each with a plan of its own.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 from chainshaper.flow.described import shape_application
+from chainshaper.flow.described_in_ros import check_ros, run_in_ros
 from chainshaper.flow.plan import plan_recording
 from chainshaper.planning import Plan, PlanRequest, save_plan
 from chainshaper.reporting.latency import write_comparison_json
@@ -22,7 +26,7 @@ from chainshaper.verify.measure import Comparison, Measurement, compare_recordin
 from chainshaper.workload.description import Application, load_application
 from chainshaper.workload.live import run_application
 
-BEFORE, AFTER = "measure as it is", "measure shaped"
+BEFORE = "measure as it is"
 _STANDARD = PlanRequest()
 _MOST_DISTURBED = 1 / 3
 """Share of cycles; where stalls of the machine hit more, the demonstration goes on."""
@@ -33,9 +37,11 @@ class Demonstration:
     """What a demonstration has shown; its files are in ``folder``.
 
     * ``before``: the application as it is, measured over all its turns.
-    * ``comparison``: of ``before`` and ``after``; None: nothing could be planned.
+    * ``comparison``: of ``before`` and of each way of shaping; None: nothing could be planned.
     * ``unplanned``: why nothing could be planned; None: it could.
     * ``longer``: whether it went on for longer, since the machine stood still too often.
+    * ``shaped``: by the titles of the ways of shaping, each beside ``before`` alone.
+    * ``plans``: of the ways.
     """
 
     folder: Path
@@ -43,11 +49,29 @@ class Demonstration:
     comparison: Comparison | None
     unplanned: str | None = None
     longer: bool = False
+    shaped: Mapping[str, Comparison] = field(default_factory=dict)
+    plans: tuple[Plan, ...] = ()
 
 
 def synthetic_chain() -> Path:
     """Return the description of the paper's synthetic chain (section 2.5)."""
     return Path(str(resources.files("chainshaper") / "examples" / "synthetic_chain.yaml"))
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way of shaping.
+
+    * ``name``: of the recording of what is shaped so.
+    * ``plan``: the name of the plan's file.
+    * ``title``: what is done, in words.
+    * ``request``: what is planned.
+    """
+
+    name: str
+    plan: str
+    title: str
+    request: PlanRequest
 
 
 def run_demo(
@@ -57,6 +81,7 @@ def run_demo(
     cycles: int = 320,
     request: PlanRequest = _STANDARD,
     realtime: bool | None = None,
+    in_ros: bool = False,
     command: Sequence[str] = (),
     planned: Callable[[Plan], None] = lambda _: None,
     progress: Progress = lambda *_: None,
@@ -68,7 +93,9 @@ def run_demo(
     cycles with the plan or of those without, two more turns follow.
 
     The recordings `before` and `after` are in ``folder``, beside `application.yaml`, `plan.yaml`,
-    `comparison.json` and `report.html`.
+    `comparison.json` and `report.html`. With ``in_ros`` the application runs as nodes of the ROS 2
+    of this environment; it is shaped in the publisher's process (`in_process`) and by a shaping
+    node (`by_node`), each by `plan_….yaml`.
 
     Raises InputError: ``folder`` exists and is not empty, or the application is not right.
     PlatformError, OperationError: a step failed; complete recordings stay, without one nothing.
@@ -76,14 +103,19 @@ def run_demo(
     folder = refuse_existing(folder)
     path = synthetic_chain() if application is None else Path(application)
     description = load_application(path)
+    if in_ros:
+        check_ros()
+        ways = _ways_in_ros(request)
+        run = partial(run_in_ros, description, realtime=realtime)
+    else:
+        ways = (Way("after", "plan.yaml", "shaped", request),)
+        run = partial(_run_live, description, realtime=realtime, command=command)
     is_new, copy = not folder.exists(), folder / "application.yaml"
     try:
         folder.mkdir(exist_ok=True)
         write_whole(copy, [path.read_bytes()])
         with folder_beside(folder / "turns") as place:
-            turns = _Turns(
-                description, cycles, Path(place), realtime, command, request, planned, progress
-            )
+            turns = _Turns(run, ways, cycles, Path(place), planned, progress)
             return _demonstrated(turns, folder)
     except OSError as error:
         raise OperationError(f"{folder}: cannot be written: {error}") from error
@@ -94,51 +126,61 @@ def run_demo(
                 folder.rmdir()
 
 
+def _ways_in_ros(request: PlanRequest) -> tuple[Way, ...]:
+    """Return the ways in which nodes of ROS 2 are shaped."""
+    in_process = replace(request, publication="in-process")
+    return (
+        Way("in_process", "plan_in_process.yaml", "held in the publisher's process", in_process),
+        Way("by_node", "plan_by_node.yaml", "held by a shaping node", request),
+    )
+
+
+def _run_live(
+    application: Application, output: Path, *, plan: Plan | None, **options: Any
+) -> Recording:
+    """Run the live workload, with a plan or without."""
+    if plan is None:
+        return run_application(application, output, **options)
+    return shape_application(application, plan, output, **options)
+
+
 @dataclass
 class _Turns:
     """The runs of a demonstration, in turns.
 
+    * ``run``: runs the application with a ``plan`` or without, and records it.
     * ``cycles``: how many are measured without a plan, and with one.
     * ``place``: a folder for the turns' recordings, until they are joined.
+    * ``after``: recordings of what is shaped, by the name of the way.
     """
 
-    application: Application
+    run: Callable[..., Recording]
+    ways: tuple[Way, ...]
     cycles: int
     place: Path
-    realtime: bool | None
-    command: Sequence[str]
-    request: PlanRequest
     planned: Callable[[Plan], None]
     progress: Progress
     before: list[Recording] = field(default_factory=list)
-    after: list[Recording] = field(default_factory=list)
+    after: dict[str, list[Recording]] = field(default_factory=dict)
 
     def as_it_is(self, cycles: int) -> None:
         """Measure the application without a plan, once more."""
-        self.before.append(
-            run_application(
-                self.application,
-                self.place / f"before{len(self.before)}",
-                cycles=cycles,
-                realtime=self.realtime,
-                command=self.command,
-                progress=self._report(f"1/3 {BEFORE}"),
-            )
-        )
+        output = self.place / f"before{len(self.before)}"
+        report = self._report(f"1/3 {BEFORE}")
+        self.before.append(self.run(output, plan=None, cycles=cycles, progress=report))
 
-    def shaped(self, plan: Plan, cycles: int) -> None:
-        """Measure the application with the plan in force, once more."""
-        self.after.append(
-            shape_application(
-                self.application,
-                plan,
-                self.place / f"after{len(self.after)}",
-                cycles=cycles,
-                realtime=self.realtime,
-                command=self.command,
-                progress=self._report(f"3/3 {AFTER}"),
-            )
-        )
+    def shaped(self, plans: Sequence[Plan], cycles: int) -> None:
+        """Measure the application shaped in each way, once more."""
+        for way, plan in zip(self.ways, plans, strict=True):
+            runs = self.after.setdefault(way.name, [])
+            step = f"3/3 measure {way.title}"
+            output, report = self.place / f"{way.name}{len(runs)}", self._report(step)
+            runs.append(self.run(output, plan=plan, cycles=cycles, progress=report))
+
+    def recorded(self) -> Iterator[tuple[str, list[Recording]]]:
+        """Yield the runs without a plan, and of each way, with the names of their recordings."""
+        yield "before", self.before
+        yield from self.after.items()
 
     def _report(self, step: str) -> Progress:
         """Report a turn's progress as that of a step, of which there may be several turns."""
@@ -149,48 +191,59 @@ def _demonstrated(turns: _Turns, folder: Path) -> Demonstration:
     """Measure and plan; then measure in turns, for longer where the machine stands still often."""
     half, longer = max(1, turns.cycles // 2), False
     turns.as_it_is(turns.cycles)
-    plan = _plan(turns)
-    if isinstance(plan, ChainshaperError):
-        if not _often_disturbed(turns.before):
+    plans = _plans(turns)
+    if isinstance(plans, ChainshaperError):
+        if not _at_the_mercy_of_others(turns.before):
             join_runs(turns.before, folder / "before")
-            raise plan
+            raise plans
         longer = True
         turns.as_it_is(turns.cycles)
-        plan = _plan(turns)
-    if isinstance(plan, ChainshaperError):
+        plans = _plans(turns)
+    if isinstance(plans, ChainshaperError):
         before = join_runs(turns.before, folder / "before")
-        return Demonstration(folder, measure_latency(before), None, str(plan), longer)
-    save_plan(plan, folder / "plan.yaml")
-    turns.planned(plan)
-    turns.shaped(plan, half)
+        return Demonstration(folder, measure_latency(before), None, str(plans), longer)
+    for way, plan in zip(turns.ways, plans, strict=True):
+        save_plan(plan, folder / way.plan)
+        turns.planned(plan)
+    turns.shaped(plans, half)
     turns.as_it_is(half)
-    turns.shaped(plan, turns.cycles - half)
-    if _often_disturbed(turns.before) or _often_disturbed(turns.after):
+    turns.shaped(plans, turns.cycles - half)
+    if any(_often_disturbed(runs) for _, runs in turns.recorded()):
         longer = True
         turns.as_it_is(half)
-        turns.shaped(plan, turns.cycles)
+        turns.shaped(plans, turns.cycles)
     turns.progress(0.5, "comparing")
-    joined = [
-        join_runs(runs, folder / name)
-        for name, runs in (("before", turns.before), ("after", turns.after))
-    ]
-    comparison = compare_recordings(joined)
+    comparison = compare_recordings(
+        [join_runs(runs, folder / name) for name, runs in turns.recorded()]
+    )
     write_comparison_json(comparison, folder)
     write_report([comparison], folder / "report.html")
-    return Demonstration(folder, comparison.measurements[0], comparison, None, longer)
+    unshaped, *after = comparison.measurements
+    shaped = {
+        way.title: replace(comparison, measurements=(unshaped, measurement))
+        for way, measurement in zip(turns.ways, after, strict=True)
+    }
+    return Demonstration(
+        folder, unshaped, comparison, longer=longer, shaped=shaped, plans=tuple(plans)
+    )
 
 
-def _plan(turns: _Turns) -> Plan | ChainshaperError:
-    """Plan from what has been measured without a plan; return why it is not possible."""
+def _plans(turns: _Turns) -> list[Plan] | ChainshaperError:
+    """Plan each way from what has been measured without a plan; return why it is not possible."""
     turns.progress(0.0, "2/3 plan")
     if len(turns.before) == 1:
         recording = turns.before[0]
     else:
         recording = join_runs(turns.before, turns.place / "planned_from")
     try:
-        return plan_recording(recording, request=turns.request)
+        return [plan_recording(recording, request=way.request) for way in turns.ways]
     except ChainshaperError as error:
         return error
+
+
+def _at_the_mercy_of_others(runs: Sequence[Recording]) -> bool:
+    """Whether what else the machine does may be why nothing can be planned."""
+    return any(run.info.realtime is False for run in runs) or _often_disturbed(runs)
 
 
 def _often_disturbed(runs: Sequence[Recording]) -> bool:

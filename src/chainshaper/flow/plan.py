@@ -52,7 +52,7 @@ def profile_chains(
     """
     recording = opened(recording)
     all_events = recording.events
-    begun = int(events.table(all_events, "callback_start")["time"].min() or 0)  # type: ignore[arg-type]
+    begun, _ = events.first_and_last_start(all_events)
     if since_ns or until_ns is not None:
         until = None if until_ns is None else begun + until_ns
         recording = replace(recording, events=events.happened(all_events, begun + since_ns, until))

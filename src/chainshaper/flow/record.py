@@ -119,6 +119,7 @@ def record_command(
     plan: Plan | None = None,
     gate_logs: Sequence[Path] = (),
     watch_stalls: bool = False,
+    ask_qos: bool = True,
     command_stdout: int | None = None,
     stop: threading.Event | None = None,
     progress: Callable[[float, str], None] = lambda *_: None,
@@ -131,6 +132,7 @@ def record_command(
     command, or a ``buffer`` (the size of LTTng's of a core, in bytes). ``chain`` is noted as the
     chain of interest, ``plan`` as the plan in force; ``gate_logs`` are where its shaping
     nodes note what they do. ``watch_stalls`` watches every core for stalls (2 % of it).
+    ``ask_qos`` has ROS 2 asked for types and QoS of topics, which takes it seconds.
 
     Raises InputError: ``output`` exists, or no such command, process or source does. PlatformError:
     the tracer or a privilege is missing. OperationError: tracing does not start, or nothing was
@@ -162,7 +164,7 @@ def record_command(
             gate_logs=gate_logs,
         )
         try:
-            _trace(run, scheduling, command_stdout, stalls=watch_stalls)
+            _trace(run, scheduling, command_stdout, stalls=watch_stalls, ask_qos=ask_qos)
             progress(1.0, "reading the events")
             recording = _written(output, run, chain, plan)
             run.tracer.written()
@@ -213,7 +215,12 @@ def _tracer(
 
 
 def _trace(
-    run: _RecordedRun, scheduling: Scheduling | None, stdout: int | None, *, stalls: bool
+    run: _RecordedRun,
+    scheduling: Scheduling | None,
+    stdout: int | None,
+    *,
+    stalls: bool,
+    ask_qos: bool,
 ) -> None:
     """Trace the application from its start to its end, and look at it meanwhile."""
     with ExitStack() as undo:
@@ -238,7 +245,9 @@ def _trace(
         if run.exit_code:
             lasted = duration_text(round(run.ended_ns - run.begun_ns, -8))
             run.notes += (f"the command {end_in_words(run.exit_code)} after {lasted}.",)
-        if run.exit_code is not None:  # types and QoS of all topics are asked of what still runs
+        if not ask_qos:
+            run.no_qos_because = None
+        elif run.exit_code is not None:  # types and QoS of all topics are asked of what still runs
             run.no_qos_because = "the application had ended by itself"
         elif run.environment is not None:
             run.endpoints, run.no_qos_because = ask_graph(run.environment)

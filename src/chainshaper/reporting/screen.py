@@ -3,8 +3,10 @@
 For people who see it for the first time. All tables stand in the report beside it.
 """
 
+import json
 import math
 import textwrap
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +42,28 @@ def comparison_lines(comparison: Comparison) -> list[Text]:
         *figure_rows(before, after),
         Text(),
         *verdict_lines(before, after),
+    ]
+
+
+def compared_before(file: Path) -> list[Text]:
+    """Make the line of a comparison that was written earlier, for its figures beside others'.
+
+    There is none where the file is no comparison of two recordings.
+    """
+    try:
+        first, last = json.loads(file.read_text(encoding="utf-8"))["recordings"]
+        seen = [first["undisturbed"], last["undisturbed"]]
+        if min(one["count"] for one in seen) < _LEAST:
+            seen = [first, last]
+        figures = [
+            f"{title} {' → '.join(_ms(one[name]) for one in seen)}"
+            for title, name in (("jitter", "jitter_ns"), ("longest", "max_ns"))
+        ]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+    return [
+        Text(f"  make demo   {', '.join(figures)}"),
+        Text(f"              ({shown(str(file.parent))})"),
     ]
 
 

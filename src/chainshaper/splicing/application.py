@@ -36,7 +36,7 @@ def splice_application(application: Application, plan: Plan) -> Application:
 
     Raises InputError: the plan shapes nothing, or does not fit the application.
     """
-    application = _placed(at_offsets(application, plan), plan)
+    application = placed_application(application, plan)
     for chain in plan.chains:
         application = _with_chain(application, chain)
     described = {*map(node_name, application.nodes)}
@@ -49,6 +49,14 @@ def splice_application(application: Application, plan: Plan) -> Application:
             " recording of this application"
         )
     return application
+
+
+def placed_application(application: Application, plan: Plan) -> Application:
+    """Return the application with timers at their chains' offsets, and nodes where servers are.
+
+    Raises InputError: as :func:`at_offsets`.
+    """
+    return _placed(at_offsets(application, plan), plan)
 
 
 def at_offsets(application: Application, plan: Plan) -> Application:

@@ -92,6 +92,18 @@ def happened(tables: EventTables, since_ns: int, until_ns: int | None = None) ->
     return chosen
 
 
+def first_and_last_start(tables: EventTables) -> tuple[int, int]:
+    """Return when the first and the last callback began (ns); 0 where none did.
+
+    Where callbacks emit no events (rclpy), they begin with a timer's call or a message's take.
+    """
+    for names in (("callback_start",), ("rcl_timer_call", "rmw_take")):
+        times = pl.concat([table(tables, name)["time"] for name in names])
+        if times.len():
+            return int(times.min()), int(times.max())  # type: ignore[arg-type]
+    return 0, 0
+
+
 def empty(name: str) -> pl.DataFrame:
     """Return an empty table with all columns of event ``name``."""
     return pl.DataFrame(schema={**COMMON_COLUMNS, **FIELDS[name]})

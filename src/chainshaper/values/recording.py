@@ -21,7 +21,13 @@ import polars as pl
 from pydantic import BaseModel, Field
 
 from chainshaper.values.errors import InputError, OperationError, shown, storable
-from chainshaper.values.events import EventTables, as_table, column_problems, happened, table
+from chainshaper.values.events import (
+    EventTables,
+    as_table,
+    column_problems,
+    first_and_last_start,
+    happened,
+)
 from chainshaper.values.files import (
     folder_beside,
     free_place,
@@ -319,7 +325,7 @@ def join_runs(runs: Sequence[Recording], output: str | Path) -> Recording:
         else happened(run.events, run.info.in_force.since_ns, run.info.in_force.until_ns)
         for run in runs
     ]
-    spans = [_span(events) for events in tables]
+    spans = [first_and_last_start(events) for events in tables]
     pauses = tuple((ended, begun) for (_, ended), (begun, _) in pairwise(spans))
     meters = [run.info.stall_meter for run in runs if run.info.stall_meter is not None]
     lost = Counter[str]()
@@ -344,12 +350,6 @@ def join_runs(runs: Sequence[Recording], output: str | Path) -> Recording:
         "checksums": None,
     }
     return write_recording(output, tables, last.model_copy(update=joined))
-
-
-def _span(tables: EventTables) -> tuple[int, int]:
-    """Return when the first and the last callback of a run started (ns)."""
-    starts = table(tables, "callback_start")["time"]
-    return int(starts.min() or 0), int(starts.max() or 0)  # type: ignore[arg-type]
 
 
 def _write_parts(folder: Path, parts: Iterable[EventTables]) -> dict[str, str]:

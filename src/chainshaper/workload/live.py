@@ -111,7 +111,7 @@ def run_application(
     if cycles < 1:
         raise InputError(f"{cycles} cycles cannot be recorded: ask for at least 1")
     check_cores(application.cores())
-    permitted = _permitted(realtime)
+    permitted = fifo_permitted(realtime)
     realtime = permitted if realtime is None else realtime
     run = _run(application, cycles, realtime=realtime, enforcement=enforcement, progress=progress)
     tables = event_tables(run.logs, run.timing.record_from_ns)
@@ -222,7 +222,7 @@ def _plan_of_others(
     return together.plan, InForceInfo(since_ns=together.since_ns, until_ns=together.until_ns)
 
 
-def _permitted(wanted: bool | None) -> bool:
+def fifo_permitted(wanted: bool | None) -> bool:
     """Whether SCHED_FIFO is permitted. Raises PlatformError: it is ``wanted``, and is not."""
     permitted = may_use_fifo()
     if wanted and not permitted:

@@ -1,0 +1,182 @@
+"""A node of a described application, for `rclpy` of Humble or later.
+
+    python3 described_node.py NODE.json --ros-args -r __node:=NAME -r __ns:=/
+
+This file is run, not imported: by the interpreter that has `rclpy`, where nothing of ours may be
+installed. `ros_nodes.py` writes what it reads.
+
+Its timers expire at multiples of their periods on CLOCK_MONOTONIC, each after its phase. They begin
+when every topic of the node has someone at the other end; then the file ``ready`` appears.
+"""
+
+import gc
+import itertools
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from builtin_interfaces.msg import Time
+from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, QoSReliabilityPolicy
+from sensor_msgs.msg import CompressedImage
+
+LOOK_S = 0.02
+SECOND = 1_000_000_000
+
+
+def main(file: str) -> None:
+    """Run the node that a file describes until it is interrupted."""
+    described = json.loads(Path(file).read_text(encoding="utf-8"))
+    rclpy.init()
+    node = DescribedNode(described)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        node.await_counterparts()
+        if described["scheduling"] is not None:
+            schedule(**described["scheduling"])
+        gc.collect()
+        gc.freeze()  # a collection does not go through all that was imported
+        Path(described["ready"]).touch()
+        node.start_timers(executor)
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)  # it may come twice
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+class DescribedNode(Node):  # type: ignore[misc]
+    """A node whose callbacks spend the described times, and pass a stamp on."""
+
+    def __init__(self, described: dict[str, Any]) -> None:
+        super().__init__("described_node")
+        self._topics: dict[str, Any] = described["topics"]
+        self._outputs: list[Any] = []
+        self._inputs: list[str] = []
+        self._timers_due: list[tuple[int, int, Any]] = []  # of each: phase, period, timer
+        for callback in described["callbacks"]:
+            work = self._work(callback)
+            if callback["timer_ns"] is not None:
+                self._add_timer(callback["timer_ns"], callback["phase_ns"], work)
+            else:
+                self._subscribe(callback["subscription"], work)
+
+    def await_counterparts(self) -> None:
+        """Wait until each topic that has both is published and subscribed to elsewhere."""
+        while rclpy.ok():
+            taken = all(output.get_subscription_count() for output in self._outputs)
+            if taken and all(map(self.count_publishers, self._inputs)):
+                return
+            time.sleep(LOOK_S)
+        raise ExternalShutdownException
+
+    def start_timers(self, executor: Any) -> None:
+        """Let each timer begin at its phase; what arrives before is worked on."""
+        now = time.monotonic_ns()
+        begins = [
+            (now + (phase_ns - now) % period_ns, number)
+            for number, (phase_ns, period_ns, _) in enumerate(self._timers_due)
+        ]
+        for begin_ns, number in sorted(begins):
+            while (left_ns := begin_ns - time.monotonic_ns()) > 0:
+                executor.spin_once(timeout_sec=left_ns / SECOND)
+            self._timers_due[number][2].reset()  # it expires first a period later
+
+    def _work(self, callback: dict[str, Any]) -> Callable[[Any, int], None]:
+        """Return what a callback does: spend its time, publish with a stamp, and do the rest."""
+        publishers, messages = [], []
+        for topic in callback["publishes"]:
+            quality = self._quality(topic)
+            if (lifespan_ns := self._topics[topic]["lifespan_ns"]) is not None:
+                quality.lifespan = Duration(nanoseconds=lifespan_ns)
+            publishers.append(self.create_publisher(CompressedImage, topic, quality))
+            if self._topics[topic]["is_taken"]:
+                self._outputs.append(publishers[-1])
+            messages.append(CompressedImage(data=bytes(self._topics[topic]["payload"])))
+        times, rest = (repeated(callback[name]) for name in ("execution_ns", "afterwards_ns"))
+
+        def work(stamp: Any, since_ns: int) -> None:
+            spend(next(times), since_ns)
+            for publisher, message in zip(publishers, messages):  # noqa: B905 - Humble's is older
+                message.header.stamp = stamp
+                publish(publisher, message)
+            spend(next(rest), time.thread_time_ns())
+
+        return work
+
+    def _subscribe(self, topic: str, work: Callable[[Any, int], None]) -> None:
+        def received(message: Any) -> None:
+            work(message.header.stamp, time.thread_time_ns())
+
+        self._inputs.append(topic)
+        self.create_subscription(CompressedImage, topic, received, self._quality(topic))
+
+    def _add_timer(self, period_ns: int, phase_ns: int, work: Callable[[Any, int], None]) -> None:
+        def expired() -> None:
+            seconds, nanoseconds = divmod(time.time_ns(), SECOND)
+            work(Time(sec=seconds, nanosec=nanoseconds), time.thread_time_ns())
+
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        # rclpy takes seconds and cuts off behind the nanosecond.
+        timer = self.create_timer((period_ns + 0.5) / SECOND, expired, clock=clock)
+        timer.cancel()
+        self._timers_due.append((phase_ns, period_ns, timer))
+
+    def _quality(self, topic: str) -> Any:
+        reliability = QoSReliabilityPolicy[self._topics[topic]["reliability"].upper()]
+        return QoSProfile(depth=self._topics[topic]["depth"], reliability=reliability)
+
+
+def publish(publisher: Any, message: Any) -> None:
+    """Publish a message. Raises ExternalShutdownException: the node was asked to end meanwhile."""
+    try:
+        publisher.publish(message)
+    except RuntimeError as error:  # rclpy's RCLError is one
+        if rclpy.ok():
+            raise
+        raise ExternalShutdownException from error
+
+
+def repeated(times_ns: list[int]) -> Iterator[int]:
+    """Yield the times again and again, in their order."""
+    return itertools.cycle(times_ns)
+
+
+def spend(cpu_ns: int, since_ns: int) -> None:
+    """Compute until this thread has used ``cpu_ns`` since its CPU clock showed ``since_ns``."""
+    clock, until = time.thread_time_ns, since_ns + cpu_ns
+    while clock() < until:
+        pass
+
+
+def schedule(executor: dict[str, int], dds: dict[str, int]) -> None:
+    """Give this thread and all others, which are of DDS, their cores and SCHED_FIFO priorities.
+
+    A gate in this process has seen to its thread by itself.
+    """
+    for thread in Path("/proc/self/task").iterdir():
+        with suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
+            if (thread / "comm").read_bytes().startswith(b"gate-"):
+                continue
+            tid = int(thread.name)
+            wanted = executor if tid == os.getpid() else dds
+            os.sched_setscheduler(tid, os.SCHED_FIFO, os.sched_param(wanted["priority"]))
+            os.sched_setaffinity(tid, {wanted["core"]})
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
