@@ -328,6 +328,7 @@ def test_a_run_lasts_from_its_first_callback_to_its_last_also_where_none_emits_e
         return {name: events.empty(name).clear(len(times)).with_columns(time=pl.Series(times))}
 
     taken, called = at("rmw_take", 5, 30), at("rcl_timer_call", 10, 20)
-    assert events.first_and_last_start(taken | called) == (5, 30)  # rclpy
-    assert events.first_and_last_start(taken | called | at("callback_start", 11, 21)) == (11, 21)
+    assert events.first_and_last_start({**taken, **called}) == (5, 30)  # rclpy
+    started = {**taken, **called, **at("callback_start", 11, 21)}
+    assert events.first_and_last_start(started) == (11, 21)
     assert events.first_and_last_start({}) == (0, 0)
