@@ -180,7 +180,7 @@ def test_pictures_and_pages_are_well_formed(recording: Recording, folder: Path) 
     assert data is not None
     assert unsafe_in(json.dumps(json.loads(data[1]), ensure_ascii=False)) == []
     assert b"\x1b]0;" not in trace.read_bytes()
-    assert len(list(figures.iterdir())) == 2
+    assert len(list(figures.iterdir())) == 3
 
 
 def test_a_plan_and_a_launch_file_are_named_harmlessly(plan: Path, folder: Path) -> None:

@@ -219,7 +219,7 @@ def test_a_pipeline_by_hand(tmp_path: Path) -> None:
 
 def test_a_stage_that_overran_goes_on_while_the_next_one_of_its_core_waits_for_it() -> None:
     """The third stage has the second's core, and the better priority: what is older goes first."""
-    plan = planned([[49, 69, 49]])
+    plan = planned([[49, 69, 48]])
     assert {server.name: (server.core, server.priority) for server in plan.servers} == {
         "stage1": (1, 2), "stage2": (0, 2), "stage3": (1, 2), "output": (1, 1)
     }  # fmt: skip
@@ -228,9 +228,9 @@ def test_a_stage_that_overran_goes_on_while_the_next_one_of_its_core_waits_for_i
         "stage1": 3, "stage2": 2, "stage3": 2, "output": 1
     }  # fmt: skip
     enforced = slots_ms(opened)
-    assert enforced["stage1"] == [(0, 100)], "through the third stage's slot, [50, 100)"
+    assert enforced["stage1"] == [(0, 99)], "through the third stage's slot, [50, 99)"
     assert enforced["stage2"] == [(0, 49), (49, 100)], "nothing else has its core"
-    assert enforced["stage3"] == [(50, 100)], "then a new instance has the core"
+    assert enforced["stage3"] == [(50, 99)], "then the output leaves"
     besides = {server.name: server.slots for server in open_until_done(plan, 0, {1}).servers}
     assert besides["stage1"] == ((0, 50 * MS),), "where other chains have the core, as planned"
     waiting = {server.name: server.slots for server in open_until_done(plan, 2 * MS).servers}
@@ -245,15 +245,26 @@ def test_a_pipeline_is_measured_on_the_cores_of_its_stages() -> None:
     assert cores_for([profile([[90, 90, 90, 90]])], (1, 0), request)["/n3"] == 0
 
 
+def test_a_gate_that_publishes_during_a_stage_has_its_time_beside_it() -> None:
+    """Stages of 50 ms each fill the core: the output leaves at 0, while the first one has it."""
+    with pytest.raises(OperationError, match=r"takes 167 ms, 1.67 .* and a stage 2.4 ms more"):
+        planned([[49, 69, 49]])
+    plan = planned([[47, 69, 47]], publish_slot_ns=5 * MS)
+    slots = slots_ms(plan)
+    assert slots["output"] == [(0, 5)], "behind the third stage there is no room for it"
+    # 47 ms, 1 ms for ε, and 1.4 ms for the gate, which watches the clock for 1 ms of these.
+    assert (slots["stage1"], slots["stage3"]) == ([(0, 49.4)], [(49.4, 98.8)])
+
+
 def test_stages_wait_for_their_turn_or_share_a_core_that_is_named_twice() -> None:
-    plan = planned([[49, 69, 49]])
+    plan = planned([[49, 69, 48]])
     assert slots_ms(plan) == {
         "stage1": [(0, 50)],
         "stage2": [(0, 19), (49, 100)],
-        "stage3": [(50, 100)],
-        "output": [(0, 1)],
+        "stage3": [(50, 99)],
+        "output": [(99, 100)],
     }
-    assert (plan.predicted.max_ns, cycles_until_output(plan)) == (201 * MS, 2)
+    assert (plan.predicted.max_ns, cycles_until_output(plan)) == (200 * MS, 1)
     assert "32.000 ms of it for stages that wait for their turn" in plan_warnings(plan)[0]
     plan = planned([[80, 80, 80]], cores=(0, 1, 1))
     assert publish_slots(plan) == ((41 * MS, 42 * MS),)

@@ -38,7 +38,13 @@ from itertools import combinations, count
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.planning.chain_plan import ChainPlan, in_one_slot, publish_slots, revised
+from chainshaper.planning.chain_plan import (
+    ChainPlan,
+    ShapingNode,
+    in_one_slot,
+    publish_slots,
+    revised,
+)
 from chainshaper.planning.overruns import in_cycle
 from chainshaper.planning.shaping import CHAIN_PRIORITY, OUTPUT_PRIORITY, server_for
 from chainshaper.values.durations import duration_text
@@ -402,7 +408,7 @@ def opened_early(
         inputs += [
             np.full(len(took), work.begins_ns[unit])
             for unit in stage.members
-            if not work.after[unit]
+            if not work.after[unit] or work.begins_ns[unit]  # a callback that begins by itself
         ]
         arrives, first = np.max(inputs, axis=0), min(int(instants.min()) for instants in inputs)
         # When the slots of its core's other stages close last before this one opened.
@@ -444,10 +450,13 @@ def pipelined(
     cores: Sequence[int] | None = None,
     *,
     room_ns: int = 0,
+    gate_ns: int = 0,
 ) -> ChainPlan:
     """Return a shaped plan with its chain in stages, on these cores (default: of ``core_of``).
 
     Each slot is ``room_ns`` longer, for what may have the core meanwhile: receivers of the output.
+    It is ``gate_ns`` longer still where the gate, whose priority is better than the stages', may
+    publish while a stage has the same core.
     A core that is named twice has two stages at a time, of which the first has the better priority:
     that is right where callbacks wait for something rather than compute.
 
@@ -456,13 +465,25 @@ def pipelined(
     before = list(dict.fromkeys(core_of[node] for unit in work.nodes for node in unit))
     # In the order of the chain, so that nodes stay where they are, if that can be.
     cores = sorted(cores or before, key=lambda core: (*before, core).index(core))
-    margin, cycle, node = plan.margin.epsilon_ns + room_ns, plan.cycle_ns, plan.shaping_node
+    node = plan.shaping_node
     if node is None:
         raise InputError("a pipeline needs a shaping node: plan with --publication synchronous")
+    staged = _in_stages(plan, node, work, cores, room_ns)
+    if _publishes_during_stage(staged):
+        staged = _in_stages(plan, node, work, cores, room_ns + gate_ns)
+    return staged
+
+
+def _in_stages(
+    plan: ChainPlan, node: ShapingNode, work: Work, cores: Sequence[int], room_ns: int
+) -> ChainPlan:
+    """Return the plan with the stages of the shortest cut, as :func:`pipelined` says."""
+    margin, cycle = plan.margin.epsilon_ns + room_ns, plan.cycle_ns
     _refuse_too_long(work, margin, cycle)
     stages = shortest_cut(work, margin, cycle, len(cores))
     if stages is None:
-        raise OperationError(_no_room(work, margin, cycle, cores))
+        named = f"{plan.chain.spec}: " if plan.chain.spec else ""
+        raise OperationError(named + _no_room(work, margin, cycle, cores))
     ((start, end),) = publish_slots(plan)
     length = end - start
     stages = opened_early(stages, work, margin, cycle, length + node.pause_ns)
@@ -484,6 +505,17 @@ def pipelined(
         servers=tuple(servers),
         shaping_node=node.model_copy(update={"core": core}),
         predicted=in_one_slot((opens, opens + length)),
+    )
+
+
+def _publishes_during_stage(plan: ChainPlan) -> bool:
+    """Return whether a stage runs on the gate's core while the output's slot is open."""
+    *stages, output = plan.servers
+    return any(
+        stage.core == output.core and opens < publishes_until and publishes_from < closes
+        for stage in stages
+        for opens, closes in stage.slots
+        for publishes_from, publishes_until in output.slots
     )
 
 

@@ -585,7 +585,7 @@ def _with_policy(plan: ChainPlan, profile: Profile, request: PlanRequest) -> Cha
         reason = f"the policy {request.policy} needs the chain's callbacks"
         raise InputError(f"{reason}: plan from a recording")
     if request.policy == "pipelined":
-        plan = _pipelined(plan, profile, request.cores)
+        plan = _pipelined(plan, profile, request)
     elif request.policy == "server-per-callback":
         margin_ns = plan.margin.epsilon_ns
         plan = shaping.server_per_callback(plan, profile.callbacks, margin_ns=margin_ns)
@@ -620,7 +620,8 @@ def _refuse_full_cores(plan: ChainPlan, profile: Profile) -> None:
             raise OperationError(f"{reason}: give the chain more cores (--cores), or shape it")
 
 
-def _pipelined(plan: ChainPlan, profile: Profile, cores: Sequence[int] | None) -> ChainPlan:
+def _pipelined(plan: ChainPlan, profile: Profile, request: PlanRequest) -> ChainPlan:
+    cores = request.cores
     steps = profile.planned_steps_ns
     if profile.all_disturbed:
         every = profile.every_planned_step_ns
@@ -628,7 +629,14 @@ def _pipelined(plan: ChainPlan, profile: Profile, cores: Sequence[int] | None) -
     reception, room_ns = profile.reception, profile.others_ns
     if reception is not None and reception.core in (None, *(cores or profile.core_of.values())):
         room_ns += reception.time_ns + reception.beside_ns
-    return pipelined(plan, _work(profile, steps), profile.core_of, cores, room_ns=room_ns)
+    return pipelined(
+        plan,
+        _work(profile, steps),
+        profile.core_of,
+        cores,
+        room_ns=room_ns,
+        gate_ns=GATE_TAKES_NS + request.spin_ns,
+    )
 
 
 def refuse_contradictions(request: PlanRequest, *, sinks: bool, modes: bool) -> None:
