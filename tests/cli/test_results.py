@@ -231,7 +231,7 @@ def test_an_application_is_described_from_scratch_and_from_a_recording(tmp_path:
     assert one["chain"] == two["chain"]
     assert two["mean_ns"] == pytest.approx(one["mean_ns"], rel=0.02)
     assert two["max_ns"] == pytest.approx(one["max_ns"], rel=0.05)
-    assert called("--version").out.startswith("chainshaper 0.")
+    assert called("--version").out.startswith("chainshaper 1.")
 
 
 def test_an_execution_that_came_once_is_in_a_description_as_often(tmp_path: Path) -> None:
