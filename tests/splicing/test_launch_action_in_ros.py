@@ -18,7 +18,7 @@ from ros2 import ros2_environment
 import chainshaper
 from chainshaper.planning import Plan, save_plan
 
-pytestmark = [pytest.mark.ros2, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.ros2("launch_ros", "ros2launch"), pytest.mark.timeout(300)]
 
 HERE = Path(__file__).parent
 COMMAND = ["env", "python3", str(HERE / "launched_with_chainshaper.py"), sys.executable]
