@@ -206,10 +206,10 @@ def judged(claim: Claim, runs: Sequence[Run]) -> dict[Column, list[Judged]]:
 
 def verdict_of(numbers: Sequence[Judged]) -> Verdict:
     """The verdict of several: of what was not taken over, all hold, none does, or partly."""
-    said = {one.verdict for one in numbers if one.verdict not in ("taken over", None)}
-    if not said:
+    verdicts = {number.verdict for number in numbers if number.verdict not in ("taken over", None)}
+    if not verdicts:
         return "taken over"
-    (only, *others) = said
+    (only, *others) = verdicts
     return "partly" if others or only is None else only
 
 

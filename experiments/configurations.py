@@ -277,12 +277,12 @@ def stood_still(recording: Recording) -> bool:
 
 def joined(blocks: Sequence[Run], repeats: int) -> Run:
     """The blocks of one configuration as one run."""
-    receptions = [one.reception_ns for one in blocks if one.reception_ns is not None]
+    receptions = [block.reception_ns for block in blocks if block.reception_ns is not None]
     return replace(
         blocks[0],
-        latency_ns=np.concatenate([one.latency_ns for one in blocks]),
-        disturbed=np.concatenate([one.disturbed for one in blocks]),
-        block=np.repeat(np.arange(len(blocks)), [one.latency_ns.size for one in blocks]),
+        latency_ns=np.concatenate([block.latency_ns for block in blocks]),
+        disturbed=np.concatenate([block.disturbed for block in blocks]),
+        block=np.repeat(np.arange(len(blocks)), [block.latency_ns.size for block in blocks]),
         repeats=repeats,
         reception_ns=np.concatenate(receptions) if len(receptions) == len(blocks) else None,
     )

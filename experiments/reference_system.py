@@ -261,30 +261,32 @@ def runs_of(found: Mapping[str, tuple[Sequence[Block], int]]) -> list[Run]:
     """
     runs = list[Run]()
     for blocks, repeats in found.values():
-        crunch = float(np.mean([one.response_ns for one in blocks])) / MS
-        drops = sum(one.drops for one in blocks)
-        latency = joined([one.latency for one in blocks], repeats)
+        crunch = float(np.mean([block.response_ns for block in blocks])) / MS
+        drops = sum(block.drops for block in blocks)
+        latency = joined([block.latency for block in blocks], repeats)
         runs.append(replace(latency, facts={DROPPED: drops, RESPONSE: crunch}))
-        runs += [joined([one.printed[what] for one in blocks], repeats) for what in PRINTED]
+        for figure_name in PRINTED:
+            runs.append(joined([block.printed[figure_name] for block in blocks], repeats))
     return runs
 
 
 def lines(runs: Sequence[Run]) -> list[Line]:
     """All figures of all runs, one configuration after the other."""
     made = list[Line]()
-    for one in CONFIGURATIONS:
-        configured = [run for run in runs if run.name.partition(",")[0] == one.name]
+    for configuration in CONFIGURATIONS:
+        configured = [run for run in runs if run.name.partition(",")[0] == configuration.name]
         for run in configured:
             made += lines_of_run(run)
         for run in configured:
-            if run.name == one.name:
+            if run.name == configuration.name:
                 about: dict[str, Any] = {"simulated": None, "live": None, "paper": None}
                 about |= {"machines": machines_of([run])}
                 lost = int((run.latency_ns < 0).sum())
-                made.append(Line(f"{one.name}: without an end", "cycles", ros_all=lost, **about))
-                for fact, what, unit in FACTS:
-                    value = run.facts.get(fact)
-                    made.append(Line(f"{one.name}{what}", unit, ros_all=value, **about))
+                name = f"{configuration.name}: without an end"
+                made.append(Line(name, "cycles", ros_all=lost, **about))
+                for fact, title, unit in FACTS:
+                    name, value = configuration.name + title, run.facts.get(fact)
+                    made.append(Line(name, unit, ros_all=value, **about))
     return made
 
 

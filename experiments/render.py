@@ -115,9 +115,9 @@ def run_all(arguments: Sequence[str], keep: Path) -> list[str]:
     failed = []
     for name in EXPERIMENTS:
         print(f"== {name}", flush=True)
-        own = ["--keep", str(keep)] if name in SHARED else []
+        shared = ["--keep", str(keep)] if name in SHARED else []
         done = subprocess.run(
-            [sys.executable, HERE / f"{name}.py", *arguments, *own],
+            [sys.executable, HERE / f"{name}.py", *arguments, *shared],
             stderr=subprocess.PIPE,
             text=True,
             check=False,
@@ -152,8 +152,10 @@ def machine(measured: str) -> str:
 
 def _letters(runs: Mapping[str, Sequence[Run]]) -> dict[str, str]:
     """A letter for each machine, in the order in which they were used."""
-    measured = {text for own in runs.values() for text in machines_of(own).values()}
-    measured |= {run.measured for own in runs.values() for run in own if run.column != "simulated"}
+    measured = set[str]()
+    for of_experiment in runs.values():
+        measured.update(machines_of(of_experiment).values())
+        measured.update(run.measured for run in of_experiment if run.column != "simulated")
     places = dict.fromkeys(machine(text) for text in sorted(measured))
     return dict(zip(places, "ABCDEFGH", strict=False))
 
@@ -213,7 +215,10 @@ def _by_machine(
 
 
 def _numbers(numbers: Sequence[Judged]) -> str:
-    marked = (f"{MARKS[one.verdict]} {one.text}" if one.verdict else one.text for one in numbers)
+    marked = []
+    for number in numbers:
+        mark = f"{MARKS[number.verdict]} " if number.verdict else ""
+        marked.append(mark + number.text)
     return "; ".join(marked)
 
 
@@ -348,8 +353,10 @@ def without_end(run: Run) -> str:
         return "0"
     at_ends = 0
     for block in set(run.blocks.tolist()):
-        ended = [not one for one in lost[run.blocks == block]]
-        at_ends += next((n for n, one in enumerate(reversed(ended)) if one), len(ended))
+        ended = [not is_lost for is_lost in lost[run.blocks == block]]
+        at_ends += next(
+            (place for place, has_ended in enumerate(reversed(ended)) if has_ended), len(ended)
+        )
     count = int(lost.sum())
     return f"{count}, {'' if at_ends == count else f'{at_ends} of them '}under way at the end"
 

@@ -42,6 +42,7 @@ from chainshaper.planning.chain_plan import (
     ChainPlan,
     ShapingNode,
     in_one_slot,
+    meet,
     publish_slots,
     revised,
 )
@@ -512,10 +513,10 @@ def _publishes_during_stage(plan: ChainPlan) -> bool:
     """Return whether a stage runs on the gate's core while the output's slot is open."""
     *stages, output = plan.servers
     return any(
-        stage.core == output.core and opens < publishes_until and publishes_from < closes
+        stage.core == output.core and meet(stage_slot, publish_slot)
         for stage in stages
-        for opens, closes in stage.slots
-        for publishes_from, publishes_until in output.slots
+        for stage_slot in stage.slots
+        for publish_slot in output.slots
     )
 
 

@@ -621,6 +621,7 @@ def _refuse_full_cores(plan: ChainPlan, profile: Profile) -> None:
 
 
 def _pipelined(plan: ChainPlan, profile: Profile, request: PlanRequest) -> ChainPlan:
+    """Return the plan in stages, cut from what the callbacks of a profile took."""
     cores = request.cores
     steps = profile.planned_steps_ns
     if profile.all_disturbed:

@@ -14,7 +14,7 @@ from chainshaper.reporting import latency as of_chain
 from chainshaper.reporting.graph_drawing import timed_graph_svg
 from chainshaper.reporting.overviews import plan_table
 from chainshaper.reporting.tables import ResultTable
-from chainshaper.values.errors import InputError, escape
+from chainshaper.values.errors import InputError, escape, installing
 from chainshaper.values.recording import Recording
 from chainshaper.verify.measure import Comparison, Measurement
 
@@ -59,7 +59,7 @@ def _picture(make: Callable[..., Any], *values: Any) -> str:
     try:
         picture = base64.b64encode(figures.png_of_figure(make, *values)).decode("ascii")
     except ModuleNotFoundError as error:
-        remedy = "pip install 'chainshaper[analysis]'"
+        remedy = installing("'chainshaper[analysis]'")
         return _line(f"The picture needs {error.name}, which is not installed: {remedy}")
     return f'<p><img src="data:image/png;base64,{picture}" style="max-width: 100%"></p>'
 

@@ -195,8 +195,8 @@ def _reasons(application: Application, callback: CallbackDescription) -> dict[st
     }
 
 
-def _refusal(what: str, reason: str) -> InputError:
+def _refusal(field: str, reason: str) -> InputError:
     return InputError(
-        f"{what} is {reason}, which nodes in rclpy do not have here: describe a callback with one"
+        f"{field} is {reason}, which nodes in rclpy do not have here: describe a callback with one"
         " subscription or timer, or write nodes in C++ (`chainshaper generate`)"
     )
