@@ -135,8 +135,8 @@ def test_what_the_tracer_dropped_is_in_every_result(tmp_path: Path) -> None:
     assert said in called("callbacks", trace, "--json").err, "its array has no place for it"
     assert "lost while recording" in called("compare", trace, trace, "--chain", "/x../y").out
     assert json_of("info", recording)["lost"] == lost
-    said = refused(2, "graph", trace, "-o", tmp_path / "graph.png")
-    assert "ends in .svg or .dot or .json" in said
+    said = refused(2, "graph", trace, "-o", tmp_path / "graph.jpeg")
+    assert "ends in .svg or .png or .dot or .json" in said
 
 
 def test_tracing_started_after_the_application(tmp_path: Path) -> None:

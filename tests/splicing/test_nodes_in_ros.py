@@ -92,11 +92,12 @@ def started(
     )
     try:
         yield child
-        child.send_signal(signal.SIGINT)
-        if child.poll() is None:
-            time.sleep(0.002)
-            child.send_signal(signal.SIGINT)  # `ros2 launch` hands on what it got itself
-        assert child.wait(20) == exit_code
+        for _ in range(20_000):  # `ros2 launch` hands on what it got itself, whenever that is
+            child.send_signal(signal.SIGINT)
+            if child.poll() is not None:
+                break
+            time.sleep(0.001)
+        assert child.wait(1) == exit_code
     finally:
         child.kill()
         child.wait()

@@ -177,6 +177,7 @@ def run(name: str, set_up: Callable[[Node], Callable[[], bool]], *, realtime: bo
     ``set_up`` makes the node's endpoints and returns a function, which is called behind each
     callback; that returns True to be called again before another message comes.
     """
+    signal.signal(signal.SIGINT, interrupt_once)
     rclpy.init()
     # The parameter file declares the parameters.
     node = Node(name, automatically_declare_parameters_from_overrides=True)
@@ -194,10 +195,18 @@ def run(name: str, set_up: Callable[[Node], Callable[[], bool]], *, realtime: bo
         node.get_logger().fatal(str(error))
         sys.exit(1)
     finally:
-        # Ctrl-C reaches a node from its terminal, and then again from `ros2 launch`.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # also where rclpy alone has seen the first
         node.destroy_node()
         rclpy.try_shutdown()
+
+
+def interrupt_once(number: int, _frame: object) -> None:
+    """Raise KeyboardInterrupt for the first Ctrl-C only, so that none interrupts its handling.
+
+    It reaches a node from its terminal, and then again from `ros2 launch`.
+    """
+    signal.signal(number, signal.SIG_IGN)
+    raise KeyboardInterrupt
 
 
 # Trace points ------------------------------------------------------------------------------------
