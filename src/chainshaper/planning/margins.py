@@ -22,6 +22,11 @@ from chainshaper.planning.late_shares import (
     most_probable,
 )
 from chainshaper.planning.latencies import check_latencies
+from chainshaper.planning.next_cycle import (
+    NextCycle,
+    latencies_behind_slot,
+    latency_with_fewest_late,
+)
 from chainshaper.planning.tails import fit_tail
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import Publication, Wishes
@@ -74,18 +79,25 @@ def _refuse_no_probability(probability: float) -> None:
 
 
 def covering_latency(
-    latencies_ns: _Latencies, wishes: Wishes, latest_slot_ns: int | None = None
+    latencies_ns: _Latencies,
+    wishes: Wishes,
+    following: NextCycle | None = None,
+    longest_ns: int = 0,
 ) -> int:
     """Return the latency (ns) that covers all cycles of a sample but the share that may be late.
 
-    The publish slot begins the least ε behind it, at ``latest_slot_ns`` at the latest (None: at any
-    time).
+    The publish slot begins the least ε behind it, and ends in the cycle that ``following`` has
+    (None: anywhere). Where that slot would leave the next instance no room, the latency is the one
+    with which the fewest outputs are late, from ``longest_ns`` on.
     """
-    latest = None
-    if latest_slot_ns is not None:
-        latest = latest_slot_ns - least_epsilon_ns(wishes.publication)
+    latest, least = None, least_epsilon_ns(wishes.publication)
+    if following is not None:
+        latest = following.latest_slot_ns - least
     share = wishes.overrun_probability or OVERRUN_PROBABILITY
-    return covered_latency(latencies_ns, share, latest, independent_cycles(latencies_ns))
+    covered = covered_latency(latencies_ns, share, latest, independent_cycles(latencies_ns))
+    if following is None:
+        return covered
+    return latency_with_fewest_late(latencies_ns, covered, longest_ns, least, following)
 
 
 def planned_margin(
@@ -93,15 +105,15 @@ def planned_margin(
     every_latency_ns: _Latencies,
     wishes: Wishes,
     *,
-    latest_slot_ns: int | None = None,
+    following: NextCycle | None = None,
     decides_slot: bool = True,
 ) -> Margin:
     """Return the margin of a chain's plan, as the wishes have it.
 
     ``latencies_ns`` are of the cycles that are planned from, ``every_latency_ns`` of all. The
-    publish slot begins at ``latest_slot_ns`` at the latest (None: at any time). Where the margin
-    does not decide where the slot begins, it covers no share of cycles, and only counts those that
-    will be late.
+    publish slot ends in the cycle that ``following`` has (None: anywhere), with room for the next
+    instance, or those that it delays count as well. Where the margin does not decide where the slot
+    begins, it covers no share of cycles, and only counts those that will be late.
 
     Raises OperationError: the sample cannot say what the margin is, or more outputs will be late
     than may be.
@@ -124,8 +136,11 @@ def planned_margin(
         return margin.model_copy(update={"overrun_probability": late})
     stalls = 0
     if covers:
-        stalls = max(0, covering_latency(sample, wishes, latest_slot_ns) - longest)
+        stalls = max(0, covering_latency(sample, wishes, following, longest) - longest)
     covers_all = covers and not wishes.ideal_machine
+    if following is not None:
+        in_time = longest + stalls
+        every_latency_ns = latencies_behind_slot(every_latency_ns, in_time, least, following)
     late = _late_by_default(every_latency_ns, longest, stalls, independent, covers_all=covers_all)
     if asked is not None and late > asked:
         reason = f"up to {late:.2g} of the outputs will be late, more than {asked:g}"

@@ -35,6 +35,7 @@ from chainshaper.planning.chain_plan import (
 )
 from chainshaper.planning.cores import assign_cores
 from chainshaper.planning.latencies import check_latencies
+from chainshaper.planning.next_cycle import NextCycle
 from chainshaper.planning.offsets import refuse_common
 from chainshaper.planning.pipeline import Work, pipelined, stage_places, work_of
 from chainshaper.planning.profile import (
@@ -361,17 +362,25 @@ def _covered(profile: Profile, request: PlanRequest) -> Profile:
     if request.percentile is not None:  # what takes longer has been left out
         return profile
     every = profile.every
-    latest_slot_ns = _latest_slot_ns(profile, request)
-    covered = every[every <= margins.covering_latency(every, request, latest_slot_ns)]
+    following = _next_cycle(profile, request)
+    covered = every[every <= margins.covering_latency(every, request, following)]
     latencies = covered if covered.size > 1 else every  # no slot fits, which the planner refuses
     return replace(profile, latencies_ns=latencies, every_latency_ns=every)
 
 
-def _latest_slot_ns(profile: Profile, request: PlanRequest) -> int | None:
-    """Return when the publish slot has to begin to end in the cycle; None: the policy places it."""
+def _next_cycle(profile: Profile, request: PlanRequest) -> NextCycle | None:
+    """Return what the publish slot has to leave room for; None: the policy places the slot."""
     if request.policy in OWN_SLOTS:
         return None
-    return profile.period_ns - _slot_ns(profile, request)
+    work_ns, reception = 0, profile.reception
+    nodes = profile.nodes
+    # The gate runs on the core of the output's publisher, before the executors of the chain.
+    if not nodes or profile.core_of.get(nodes[0]) == profile.core_of.get(nodes[-1]):
+        work_ns = GATE_TAKES_NS + (profile.longest_publication_ns or 0)
+        if reception is not None and request.with_receivers:
+            work_ns += reception.time_ns + reception.beside_ns
+    slot_ns = _slot_ns(profile, request)
+    return NextCycle(profile.period_ns, slot_ns, work_ns, request.overrun or "publish")
 
 
 def _slot_ns(profile: Profile, request: PlanRequest) -> int:
@@ -551,7 +560,7 @@ def _margin(profile: Profile, request: PlanRequest) -> Margin:
         profile.latencies_ns,
         profile.every,
         request,
-        latest_slot_ns=_latest_slot_ns(profile, request),
+        following=_next_cycle(profile, request),
         decides_slot=request.policy not in OWN_SLOTS or request.policy == "pipelined",
     )
 
