@@ -1,4 +1,4 @@
-"""Slots at the end of a cycle: what they cost the next instance, worked by hand and by brute force."""
+"""A slot at the end of a cycle and what it costs the next instance: by hand, by brute force."""
 
 import numpy as np
 import pytest
