@@ -554,7 +554,42 @@ _SWITCHES = (
     ),
 )
 
+# The functions by which a loop's thread sleeps, by the numbers in `thread_sleep` and `thread_wake`.
+SLEEPING_CALLS = (
+    "none",  # of `thread_wake`: the thread did not sleep; its sleeps are recorded from here on
+    "clock_nanosleep",
+    "nanosleep",
+    "pthread_cond_timedwait",
+    "pthread_cond_clockwait",
+    "poll",  # and ppoll
+    "epoll_wait",  # and epoll_pwait, epoll_pwait2
+    "select",  # and pselect; `time.sleep` of Python before 3.11
+    "timerfd",  # read of a timer's file
+)
+
 _OURS = (
+    # A thread goes to sleep for a time, outside callbacks, or wakes up from it: what lies between a
+    # wake-up and the next sleep is an instance of a loop. The tracing library emits both, for
+    # threads that publish or take outside callbacks, and for those that `record --loop` names.
+    Event(
+        "thread_sleep",
+        "messages",
+        (
+            EventField("until", "nanoseconds", 0),  # 0: the call does not say it
+            EventField("call", "count", 1),  # place in SLEEPING_CALLS
+            EventField("thread_time", "nanoseconds", presence="optional", record_place=2),
+        ),
+        recorded_by_library="arguments",
+    ),
+    Event(
+        "thread_wake",
+        "messages",
+        (
+            EventField("call", "count", 0),
+            EventField("thread_time", "nanoseconds", presence="optional", record_place=2),
+        ),
+        recorded_by_library="arguments",
+    ),
     # A timer was called, and its callback comes next; of rclpy's timers no other event tells. The
     # tracing library emits it, which stands in front of rcl.
     Event(
