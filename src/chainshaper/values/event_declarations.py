@@ -565,9 +565,18 @@ SLEEPING_CALLS = (
     "epoll_wait",  # and epoll_pwait, epoll_pwait2
     "select",  # and pselect; `time.sleep` of Python before 3.11
     "timerfd",  # read of a timer's file
+    "rmw_wait",  # an executor waits for work, in a thread that publishes outside callbacks
 )
 
 _OURS = (
+    # The user named a loop by its node, which was created in this process (`is_thread` 0), or by
+    # the name of its thread, which is the event's `tid`.
+    Event(
+        "loop_named",
+        "creation",
+        (EventField("name", "text", 0), EventField("is_thread", "count", 1)),
+        recorded_by_library="arguments",
+    ),
     # A thread goes to sleep for a time, outside callbacks, or wakes up from it: what lies between a
     # wake-up and the next sleep is an instance of a loop. The tracing library emits both, for
     # threads that publish or take outside callbacks, and for those that `record --loop` names.
