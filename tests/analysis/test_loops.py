@@ -181,6 +181,46 @@ def test_a_python_loop_that_is_faster_than_its_input_has_a_cycle_for_each_messag
     assert latencies(python_loop(sleeps=sleeps), "/a../cmd") == expected
 
 
+def ages(story: Story, chain: str) -> list[tuple[int, int | None, int | None, int | None]]:
+    """Start of each cycle of the loop; the data's age there and at the end; which use it is."""
+    age = analyse_latency(data_flow(story.tables()), chain).data_age
+    assert age is not None
+    return age.cycles.select("start", "age_at_loop_ns", "age_at_end_ns", "use").rows()
+
+
+def test_the_age_of_what_a_loop_uses_is_known_for_each_of_its_cycles() -> None:
+    """/a leaves its sensor's callback at 0 and 200. The loop publishes 30 behind its start."""
+    story, _ = loop_behind((0, 200, 210), (5, 100, 200, 300, 400))
+    assert ages(story, "/a../cmd") == [
+        (5, None, None, None),  # nothing is stored yet
+        (100, 100, 130, 1),
+        (200, 200, 230, 2),
+        (300, 90, 120, 1),  # of 210, the newer one
+        (400, 190, 220, 2),
+    ]
+    age = analyse_latency(data_flow(story.tables()), "/a../cmd").data_age
+    assert age is not None
+    assert (age.uses, age.most_uses) == ({"never": 1, "once": 0, "again": 2}, 2)
+
+
+def test_the_age_at_the_end_is_that_of_the_output_behind_the_loop() -> None:
+    """/out reads each command 5 behind it and publishes 3 later."""
+    story, _ = loop_behind((0,), (100, 200))
+    drives, out = story.relay("/drive", 30, "/cmd", "/out")
+    for sent in (130, 230):
+        story.runs(drives, sent + 5, sent + 10, reads=sent, writes=((out, sent + 8),))
+    assert latencies(story, "/a../out") == [(0, 138)]
+    assert ages(story, "/a../out") == [(100, 100, 138, 1), (200, 200, 238, 2)]
+
+
+def test_what_a_loop_takes_itself_is_as_old_as_when_it_is_taken() -> None:
+    assert ages(python_loop(sleeps=True), "/a../cmd")[:3] == [
+        (100, 52, 60, 1),
+        (200, 150, 160, 2),
+        (300, 52, 60, 1),
+    ]
+
+
 def named(story: Story, name: str, *, tid: int = PID, is_thread: int = 0) -> None:
     story.event("loop_named", 1, PID, tid, name=name, is_thread=is_thread)
 
@@ -209,6 +249,8 @@ def test_a_named_loop_that_publishes_nothing_ends_a_chain_with_the_end_of_its_tu
     story = controller(is_thread=is_thread)
     assert latencies(story, "/a../manager:end") == [(0, 150), (200, 350)]
     assert row(story, "/manager")["count"] == 4
+    expected = [(100, 100, 150, 1), (200, 200, 250, 2), (300, 100, 150, 1), (400, 200, 250, 2)]
+    assert ages(story, "/a../manager:end") == expected
 
 
 def test_a_loop_that_is_not_named_reads_nothing_of_other_nodes() -> None:

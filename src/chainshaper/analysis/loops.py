@@ -369,7 +369,9 @@ def _notes(loop: _Loop, turns: pl.DataFrame) -> Iterator[str]:
     starts = turns["start"].sort().to_numpy()
     if len(starts) < 3 or _is_regular(starts):
         return
-    low, usual, high = (duration_text(round(v)) for v in np.percentile(np.diff(starts), (5, 50, 95)))
+    low, usual, high = (
+        duration_text(round(v)) for v in np.percentile(np.diff(starts), (5, 50, 95))
+    )
     yield (
         f"the loop of {loop.node} (thread {', '.join(map(str, loop.tids))}) sleeps irregularly:"
         f" usually {usual} lie between its starts, from {low} (p5) to {high} (p95). It has no"
@@ -397,7 +399,9 @@ def loop_figures(
     late = pl.col("start") - pl.col("due")
     figures = rows.sort("start").group_by("callback_id")
     return figures.agg(
-        phase_ns=((pl.col("start").last() + within.median()).round().cast(pl.Int64) % period.last()),
+        phase_ns=(
+            (pl.col("start").last() + within.median()).round().cast(pl.Int64) % period.last()
+        ),
         start_jitter_ns=late.max() - late.min(),
         overruns=pl.when(pl.col("overran").count() > 0).then(pl.col("overran").sum()),
     )

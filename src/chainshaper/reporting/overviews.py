@@ -165,7 +165,9 @@ def callback_table(statistics: pl.DataFrame) -> ResultTable:
             ms(row[name]) if name != "overruns" or row[name] is None else row[name]
             for name in of_loops
         )
-        table.add(row["node"] or "", shown, symbol, listed(row["tids"]), row["count"], *times, *loop)
+        table.add(
+            row["node"] or "", shown, symbol, listed(row["tids"]), row["count"], *times, *loop
+        )
     return table
 
 
