@@ -1,4 +1,4 @@
-"""How threads sleep, as the library in front of ROS 2 sees it: a program with a loop of each kind."""
+"""How threads sleep, as the library in front of ROS 2 sees it: programs with loops."""
 
 import shutil
 import subprocess

@@ -1,9 +1,10 @@
 """The age of the data that a loop works with, in each of its cycles.
 
 A chain's latency is its reaction: from the sensor to the first output into which a message went. A
-loop also works between two messages, with older data, and at its own phase. So of each of its cycles
-it is told which message it used, how old that was when the loop read it, and when the chain's output
-left. The age counts from the start of the chain's first callback, as the latency does.
+loop also works between two messages, with older data, and at its own phase. So this module says of
+each of its cycles which message it used, how old that was when the loop read it, and how old when
+the chain's output left. The age counts from the start of the chain's first callback, as the latency
+does.
 
 The message is the one that the node stored last before the turn began, or that the loop took itself
 in this turn. That the newest one wins is an inference: a node that queues its inputs uses older
@@ -64,7 +65,7 @@ def data_age(
         reading = readers(graph, path[hop], topic) if topic in path[hop].passes_on else []
         loops = [reader for reader in reading if reader.kind == "loop"]
         if loops and len(reading) == 1:
-            return _ages_at(flow, traversals, graph, hop, loops[0], between)
+            return _ages_at(flow, traversals, graph, hop, loop=loops[0], between=between)
     return None
 
 
@@ -73,6 +74,7 @@ def _ages_at(
     traversals: Traversals,
     graph: ApplicationGraph,
     hop: int,
+    *,
     loop: Callback,
     between: tuple[int, int | None] | None,
 ) -> DataAge:

@@ -5,15 +5,15 @@ robots is no callback. The tracing library in front of ROS 2 records when such a
 sleep and wakes up (`thread_sleep`, `thread_wake`).
 
 * **A turn** is what lies between two sleeps of a thread. It is an instance of the loop.
-* **A loop** is a thread that publishes outside callbacks, or that the user named. One that publishes
-  for several nodes is a loop of each. Topics that are never published in the same turn belong to
-  different loops of one thread: each has the turns in which it published.
+* **A loop** is a thread that publishes outside callbacks, or that the user named. One that
+  publishes for several nodes is a loop of each. Topics that are never published in the same turn
+  belong to different loops of one thread: each has the turns in which it published.
 * **In Python** no event shows where a callback ends. What is published again, turns after the
   message that its thread took last, is not that callback's: a loop publishes it.
 * **A loop that is paced by data** mostly wakes up before the time for which it wanted to sleep, or
   waits without one. Its publications count as those of a thread that no sleep explains.
-* **A named loop** (`loop_named`) may publish nothing, as one that writes to hardware. The end of each
-  of its turns counts as a publication on ``NODE:end``, so that a chain can end there.
+* **A named loop** (`loop_named`) may publish nothing, as one that writes to hardware. The end of
+  each of its turns counts as a publication on ``NODE:end``, so that a chain can end there.
 
 Without events of sleeps (LTTng, eBPF, older recordings) a thread that publishes regularly counts as
 a loop whose turn begins with its publication (:func:`seems_regular`).
@@ -77,8 +77,8 @@ def thread_turns(tables: events.EventTables) -> pl.DataFrame:
 
     * ``turn``: numbered from 0.
     * ``pid``, ``tid``.
-    * ``start``, ``end``: when the thread woke up, and went to sleep again (ns; ``end`` is null where
-      it did not, or the event was lost).
+    * ``start``, ``end``: when the thread woke up, and went to sleep again (ns; ``end`` is null
+      where it did not, or the event was lost).
     * ``due``: until when it had wanted to sleep (ns; null: not known).
     * ``left_ns``: how long it wanted to sleep behind ``end``; 0 or less: the time was over already.
     * ``call``: by which function it had slept, a place in SLEEPING_CALLS.
@@ -385,8 +385,8 @@ def loop_figures(
     """Compute what is known of loops beside the figures of all callbacks, a row for each. Columns:
 
     * ``callback_id``.
-    * ``phase_ns``: how long after a multiple of its period, on the clock of events, it usually starts
-      (null: it has no period).
+    * ``phase_ns``: how long after a multiple of its period, on the clock of events, it usually
+      starts (null: it has no period).
     * ``start_jitter_ns``: of its starts behind the end of its time to sleep, the latest less the
       earliest (null: not known).
     * ``overruns``: instances that ended when the next one should have begun (null: not known).

@@ -145,7 +145,7 @@ def traverse(flow: DataFlow, chain: Chain, graph: ApplicationGraph | None = None
         state = _publish(flow, state, hop, [callback.id, *standby], topic)
         if topic in callback.passes_on or (hop and goes_on_elsewhere(graph, callback, topic)):
             reading = readers(graph, callback, topic)
-            state, note = _publish_by_sibling(flow, state, hop, callback, topic, reading)
+            state, note = _publish_by_sibling(flow, state, hop, callback, topic, reading=reading)
             if _keeps_newest(graph, callback, topic):
                 state = _newest_alone(state, hop)
             notes += note
@@ -218,6 +218,7 @@ def _publish_by_sibling(
     hop: int,
     callback: Callback,
     topic: str,
+    *,
     reading: Sequence[Callback],
 ) -> tuple[pl.DataFrame, list[str]]:
     """Fill in what another callback of the node published for the message.

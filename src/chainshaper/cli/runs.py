@@ -255,7 +255,7 @@ def record(
     loop: list[str] | None = opt.option(
         "--loop NAME",
         "A loop that is no callback, by its node (/name) or its thread's name (preload; may be "
-        "repeated). Needed only where its thread publishes nothing, as one that writes to hardware.",
+        "repeated). For threads that publish nothing, as those that write to hardware.",
         rich_help_panel=opt.TRACING,
     ),
     watch_stalls: bool = opt.option(

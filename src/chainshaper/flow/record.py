@@ -131,9 +131,9 @@ def record_command(
     one, `ebpf` and `preload` attach to ``pids`` and their descendants, or to all that ``users`` run
     (as :func:`.find_threads`). Without ``source`` it is `preload`, or `lttng` where there is no
     command, or a ``buffer`` (the size of LTTng's of a core, in bytes). ``loops`` are names of nodes
-    and threads whose loops are recorded although they publish nothing (`preload` only). ``chain`` is
-    noted as the chain of interest, ``plan`` as the plan in force; ``gate_logs`` are where its shaping
-    nodes note what they do. ``watch_stalls`` watches every core for stalls (2 % of it).
+    and threads whose loops are recorded although they publish nothing (`preload` only). ``chain``
+    is noted as the chain of interest, ``plan`` as the plan in force; ``gate_logs`` are where its
+    shaping nodes note what they do. ``watch_stalls`` watches every core for stalls (2 % of it).
     ``ask_qos`` has ROS 2 asked for types and QoS of topics, which takes it seconds.
 
     Raises InputError: ``output`` exists, or no such command, process or source does. PlatformError:

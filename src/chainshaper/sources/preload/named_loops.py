@@ -1,8 +1,8 @@
 """Loops that the user names: what the tracing library is told, and what is said of those not seen.
 
-A loop is named by its node (`/controller_manager`), where a thread of the node's process sleeps, or
-by the name of its thread (`control_loop`). `preload.c` records the sleeps of such threads also where
-they publish nothing, and emits `loop_named` for each name that it meets.
+A loop is named by its node (`/controller_manager`), where a thread of the node's process sleeps,
+or by the name of its thread (`control_loop`). `preload.c` records the sleeps of such threads also
+where they publish nothing, and emits `loop_named` for each name that it meets.
 """
 
 from collections.abc import Iterator, Sequence

@@ -35,7 +35,8 @@ _CREDENTIALS = struct.Struct("iII")  # struct ucred: pid, uid, gid
 class PreloadTracer:
     """Records with the library in front: a :class:`~chainshaper.sources.Tracer`.
 
-    A thread of its own reads the memories, until ``stop``. ``loops`` are names of nodes and threads.
+    A thread of its own reads the memories, until ``stop``. ``loops`` are names of nodes and of
+    threads.
 
     Raises InputError: a loop cannot have such a name.
     """
