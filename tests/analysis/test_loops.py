@@ -4,59 +4,11 @@ from typing import Any
 
 import polars as pl
 import pytest
-from story import Callback, Publisher, Story
+from loop_story import LOOP, NANOSLEEP, PID, RMW_WAIT, first_sleep, loop_behind, turn
+from story import Story
 
 from chainshaper.analysis import analyse_latency, callback_statistics, data_flow, graph_of
 from chainshaper.analysis.loops import thread_turns
-from chainshaper.values.event_declarations import SLEEPING_CALLS
-
-NANOSLEEP, RMW_WAIT = (SLEEPING_CALLS.index(name) for name in ("clock_nanosleep", "rmw_wait"))
-PID, LOOP = 20, 22
-
-
-def turn(
-    story: Story,
-    woke: int,
-    sleeps: int,
-    until: int,
-    *,
-    tid: int = LOOP,
-    pid: int = PID,
-    call: int = NANOSLEEP,
-    writes: tuple[tuple[Publisher, int], ...] = (),
-) -> None:
-    """What lies between two sleeps; the thread uses 60 % of the time between them."""
-    used = woke * 10
-    story.event("thread_wake", woke, pid, tid, call=call, thread_time=used)
-    for publisher, time in writes:
-        story.publish(publisher, time, tid)
-    later = {"until": until, "call": call, "thread_time": used + (sleeps - woke) * 6 // 10}
-    story.event("thread_sleep", sleeps, pid, tid, **later)
-
-
-def first_sleep(story: Story, time: int, until: int, tid: int = LOOP, pid: int = PID) -> None:
-    story.event("thread_sleep", time, pid, tid, until=until, call=NANOSLEEP)
-
-
-def loop_behind(
-    inputs: tuple[int, ...], wakes: tuple[int, ...], *, publishes: int = 30
-) -> tuple[Story, Callback]:
-    """/sensor sends /a at these times; a loop of /actor stores it and publishes /cmd.
-
-    The subscription runs 10 behind the sending, on another thread than the loop. A turn lasts 50,
-    publishes 30 after its beginning, and was due 1 before it.
-    """
-    story = Story()
-    timer, sensor = story.source("/sensor", 10, "/a")
-    node = story.node("/actor", PID)
-    reader, cmd = story.subscription(node, "/a"), story.publisher(node, "/cmd")
-    for at in inputs:
-        story.runs(timer, at, at + 2, writes=((sensor, at + 1),))
-        story.runs(reader, at + 10, at + 12, reads=at + 1, tid=21)
-    first_sleep(story, wakes[0] - 60, wakes[0] - 1)
-    for woke, following in zip(wakes, (*wakes[1:], wakes[-1] + 100), strict=True):
-        turn(story, woke, woke + 50, following - 1, writes=((cmd, woke + publishes),))
-    return story, reader
 
 
 def latencies(story: Story, chain: str) -> list[tuple[int, int]]:
@@ -71,7 +23,7 @@ def row(story: Story, node: str = "/actor", kind: str = "loop") -> dict[str, Any
 
 
 def test_a_turn_is_what_lies_between_two_sleeps() -> None:
-    story, _ = loop_behind((0,), (100, 200, 300))
+    story = loop_behind((0,), (100, 200, 300))
     turns = thread_turns(story.tables())
     assert turns.select("start", "end", "due", "left_ns", "execution_ns").rows() == [
         (100, 150, 99, 49, 30),
@@ -92,7 +44,7 @@ def test_a_turn_whose_sleep_was_lost_has_no_end() -> None:
 
 
 def test_a_loop_is_shown_like_a_timer() -> None:
-    story, _ = loop_behind((0, 200), (100, 200, 300, 400))
+    story = loop_behind((0, 200), (100, 200, 300, 400))
     loop = row(story)
     assert (loop["period_ns"], loop["count"], loop["tids"]) == (100, 4, [LOOP])
     assert loop["response_ns"] == {"min": 50, "mean": 50, "max": 50}
@@ -105,18 +57,18 @@ def test_a_loop_is_shown_like_a_timer() -> None:
 
 def test_what_was_stored_last_before_a_turn_is_what_it_used_and_repeats_are_no_cycles() -> None:
     """Two turns for each message: the first use is the reaction."""
-    story, _ = loop_behind((0, 200, 400), (100, 200, 300, 400, 500, 600))
+    story = loop_behind((0, 200, 400), (100, 200, 300, 400, 500, 600))
     assert latencies(story, "/a../cmd") == [(0, 130), (200, 330), (400, 530)]
 
 
 def test_a_message_that_comes_while_a_turn_computes_goes_into_the_next() -> None:
     """It is stored at 110, before the turn publishes at 130."""
-    story, _ = loop_behind((100,), (100, 200))
+    story = loop_behind((100,), (100, 200))
     assert latencies(story, "/a../cmd") == [(100, 230)]
 
 
 def test_of_two_messages_before_a_turn_the_newer_one_is_used() -> None:
-    story, _ = loop_behind((0, 20), (100, 200))
+    story = loop_behind((0, 20), (100, 200))
     analysis = analyse_latency(data_flow(story.tables()), "/a../cmd")
     assert analysis.traversals["latency_ns"].to_list() == [None, 110]
     assert analysis.incomplete == {"not used": 1}
@@ -190,7 +142,7 @@ def ages(story: Story, chain: str) -> list[tuple[int, int | None, int | None, in
 
 def test_the_age_of_what_a_loop_uses_is_known_for_each_of_its_cycles() -> None:
     """/a leaves its sensor's callback at 0 and 200. The loop publishes 30 behind its start."""
-    story, _ = loop_behind((0, 200, 210), (5, 100, 200, 300, 400))
+    story = loop_behind((0, 200, 210), (5, 100, 200, 300, 400))
     assert ages(story, "/a../cmd") == [
         (5, None, None, None),  # nothing is stored yet
         (100, 100, 130, 1),
@@ -205,7 +157,7 @@ def test_the_age_of_what_a_loop_uses_is_known_for_each_of_its_cycles() -> None:
 
 def test_the_age_at_the_end_is_that_of_the_output_behind_the_loop() -> None:
     """/out reads each command 5 behind it and publishes 3 later."""
-    story, _ = loop_behind((0,), (100, 200))
+    story = loop_behind((0,), (100, 200))
     drives, out = story.relay("/drive", 30, "/cmd", "/out")
     for sent in (130, 230):
         story.runs(drives, sent + 5, sent + 10, reads=sent, writes=((out, sent + 8),))
@@ -254,7 +206,7 @@ def test_a_named_loop_that_publishes_nothing_ends_a_chain_with_the_end_of_its_tu
 
 
 def test_a_loop_that_is_not_named_reads_nothing_of_other_nodes() -> None:
-    story, _ = loop_behind((0,), (100, 200))
+    story = loop_behind((0,), (100, 200))
     other = story.subscription(story.node("/monitor", PID), "/a")
     graph = graph_of(data_flow(story.tables()))
     (monitor,) = (c for c in graph.callbacks if c.handle == other.handle)
@@ -262,7 +214,7 @@ def test_a_loop_that_is_not_named_reads_nothing_of_other_nodes() -> None:
 
 
 def test_a_thread_that_sleeps_irregularly_has_no_period_and_its_spread_is_said() -> None:
-    story, _ = loop_behind((0,), (100, 200, 330, 700, 760, 1000, 1900))
+    story = loop_behind((0,), (100, 200, 330, 700, 760, 1000, 1900))
     assert row(story)["period_ns"] is None
     (note,) = (n for n in data_flow(story.tables()).notes if "irregularly" in n)
     assert "usually" in note and "(p95)" in note and "nothing is to be planned" in note
@@ -319,7 +271,7 @@ def in_cpp(story: Story, node: Any) -> None:
 
 def test_without_events_of_sleeps_a_thread_that_publishes_regularly_is_a_loop() -> None:
     """Its instances are known by their publications alone."""
-    story, _ = loop_behind((0, 200, 400), tuple(range(100, 1300, 100)))
+    story = loop_behind((0, 200, 400), tuple(range(100, 1300, 100)))
     in_cpp(story, story.node("/actor", PID))
     del story.rows["thread_sleep"], story.rows["thread_wake"]
     loop = row(story)
@@ -330,7 +282,7 @@ def test_without_events_of_sleeps_a_thread_that_publishes_regularly_is_a_loop() 
 
 
 def test_without_sleeps_a_thread_that_publishes_irregularly_is_no_loop() -> None:
-    story, _ = loop_behind((0,), (100, 110, 190, 300, 305, 400, 620, 700, 1100, 1110, 1300))
+    story = loop_behind((0,), (100, 110, 190, 300, 305, 400, 620, 700, 1100, 1110, 1300))
     in_cpp(story, story.node("/actor", PID))
     del story.rows["thread_sleep"], story.rows["thread_wake"]
     kinds = data_flow(story.tables()).objects.callbacks.filter(pl.col("handle") == 0)["kind"]

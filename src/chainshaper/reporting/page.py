@@ -210,7 +210,10 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
 
 def _data_age(analysis: LatencyAnalysis) -> str:
     """Make the HTML of the table of the age of a loop's data; empty: the chain has no loop."""
-    return "" if analysis.data_age is None else of_chain.data_age_table(analysis.data_age).html()
+    if analysis.data_age is None:
+        return ""
+    table = of_chain.data_age_table(analysis.data_age)
+    return _paragraph(f"{table.title}:") + table.html() + _paragraph(table.caption)
 
 
 def _tables(parts: Sequence[_NamedMeasurement], suffix: str, several: bool) -> dict[str, str]:
