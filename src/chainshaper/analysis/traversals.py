@@ -257,7 +257,8 @@ def _publish_by_sibling(
     state = state.with_columns(
         pl.coalesce(publication, later), (pl.col(sibling) | later.is_not_null()).alias(sibling)
     )
-    if callback.kind == "service" or MESSAGE_FILTER not in (callback.symbol or MESSAGE_FILTER):
+    stores = MESSAGE_FILTER not in (callback.symbol or MESSAGE_FILTER) or loops
+    if callback.kind == "service" or stores:
         return state, []  # a callback that stores its latest message: old values are its purpose
     reached = state[publication].drop_nulls()
     between = candidates.filter(pl.col("later").is_between(reached.min(), reached.max())).height
