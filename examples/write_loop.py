@@ -67,7 +67,7 @@ def main(output: str) -> None:
         taken = {"source_timestamp": at + MS // 2 + CLOCK_OFFSET, "taken": 1, "message": 1}
         event("rmw_take", stored, CONTROLLER, CONTROLLER, rmw_subscription_handle=7, **taken)
         callback(stored + 10_000, stored + 30_000, CONTROLLER)
-    for due in range(43 * MS, 4000 * MS, 10 * MS):
+    for due in range(33 * MS, 4000 * MS, 10 * MS):
         asleep, woke = due - 8 * MS, due + times.randrange(20_000, 90_000)
         event("thread_sleep", asleep, CONTROLLER, LOOP, until=due, call=CLOCK_NANOSLEEP)
         rows["thread_sleep"][-1]["thread_time"] = asleep

@@ -229,8 +229,65 @@ def test_a_loop_that_is_woken_before_its_time_is_paced_by_data() -> None:
         turn(story, woke, woke + 50, woke + 1000, writes=((out, woke + 10),))
     flow = data_flow(story.tables())
     assert flow.objects.callbacks["kind"].to_list() == ["unknown"]
-    (note,) = (n for n in flow.notes if "paced by data" in n)
-    assert "/driver publishes /points" in note and str(LOOP) in note
+    (note,) = flow.notes
+    assert "/driver publishes /points" in note and str(LOOP) in note and "paced by data" in note
+
+
+def test_a_loop_that_never_sleeps_for_a_time_is_paced_by_data() -> None:
+    """It blocks on a device: that it is followed is all that is known of its thread."""
+    story = Story()
+    node = story.node("/driver", PID)
+    in_cpp(story, node)
+    out = story.publisher(node, "/points")
+    story.event("thread_wake", 100, PID, LOOP, call=0)
+    for at in range(100, 2000, 100):
+        story.publish(out, at, LOOP)
+    flow = data_flow(story.tables())
+    assert flow.objects.callbacks.filter(handle=0)["kind"].to_list() == ["unknown"]
+    assert any("paced by data" in note and str(LOOP) in note for note in flow.notes)
+
+
+def queueing(counts: tuple[int, ...]) -> Story:
+    """A loop that publishes for every message; so many come before each of its turns, 10 apart."""
+    story = Story()
+    timer, sensor = story.source("/sensor", 10, "/a")
+    node = story.node("/actor", PID)
+    reader, cmd = story.subscription(node, "/a"), story.publisher(node, "/cmd")
+    first_sleep(story, 40, 99)
+    for number, count in enumerate(counts):
+        woke = 100 * (number + 1)
+        for place in range(count):
+            at = woke - 50 + 10 * place
+            story.runs(timer, at, at + 2, writes=((sensor, at + 1),))
+            story.runs(reader, at + 4, at + 6, reads=at + 1, tid=21)
+        writes = tuple((cmd, woke + 10 + place) for place in range(count))
+        turn(story, woke, woke + 40, woke + 99, writes=writes)
+    return story
+
+
+def test_a_loop_that_publishes_for_each_message_queues_them() -> None:
+    """Three came before the second turn: each has its own publication, in order."""
+    assert latencies(queueing((1, 3, 0, 1)), "/a../cmd") == [
+        (50, 110),
+        (150, 210),
+        (160, 211),
+        (170, 212),
+        (350, 410),
+    ]
+    assert ages(queueing((1, 3)), "/a../cmd") == [
+        (100, 50, 60, 1),
+        (200, 50, 60, 1),
+        (200, 40, 51, 1),
+        (200, 30, 42, 1),
+    ]
+
+
+def test_a_node_whose_named_loop_may_be_one_of_several_threads_is_named() -> None:
+    story = controller()
+    first_sleep(story, 60, 109, tid=LOOP + 1)
+    turn(story, 110, 120, 209, tid=LOOP + 1)
+    (note,) = (n for n in data_flow(story.tables()).notes if "Name the thread instead" in n)
+    assert f"({LOOP}, {LOOP + 1})" in note
 
 
 def test_two_loops_of_one_thread_are_told_apart_by_what_they_publish() -> None:

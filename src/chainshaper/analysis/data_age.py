@@ -6,9 +6,9 @@ each of its cycles which message it used, how old that was when the loop read it
 the chain's output left. The age counts from the start of the chain's first callback, as the latency
 does.
 
-The message is the one that the node stored last before the turn began, or that the loop took itself
-in this turn. That the newest one wins is an inference: a node that queues its inputs uses older
-ones, and no event shows it.
+Which message that is, the traversals say (:mod:`~chainshaper.analysis.traversals`): the newest that
+was stored before the turn began, or that the loop took itself in this turn. That the newest one
+wins is an inference, unless the loop evidently queues its messages.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,6 @@ import polars as pl
 
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.graph import readers
-from chainshaper.analysis.matching import latest_before
 from chainshaper.analysis.traversals import Traversals, traverse
 from chainshaper.values.application import ApplicationGraph, Callback, Chain
 
@@ -81,21 +80,26 @@ def _ages_at(
     """Say what a loop worked with that reads what the chain's callback at ``hop`` stores."""
     topic = traversals.chain.topics[hop]
     begun = traversals.frame.select("traversal", begun="start")
-    messages = traversals.hops.filter(pl.col("hop") == hop).select(
-        "traversal",
-        stored="start",
-        tid=pl.lit(flow.instances["tid"]).gather("instance"),
-    )
-    messages = messages.join(begun, on="traversal").sort("stored", maintain_order=True)
+    messages = traversals.hops.filter(pl.col("hop") == hop)
+    messages = messages.select("traversal", "publication", stored="start")
+    messages = messages.join(begun, on="traversal", maintain_order="left")
     outputs = flow.publications.filter(
         pl.col("instance").is_not_null(), callback_id=loop.id, topic=topic
-    ).select("publication", "instance", "tid", "time", publish="sent")
+    ).select("publication", "instance", "time", publish="sent")
     start = pl.lit(flow.instances["start"]).gather("instance")
     outputs = outputs.with_columns(start=start).sort("time", maintain_order=True)
-    used = _with_used(outputs, messages)
-    used = used.join(_ends(flow, traversals.chain, graph, hop, loop), on="publication", how="left")
+    # What is published without a new message repeats the one before.
+    first_uses = messages.drop_nulls("publication")
+    used = outputs.join(first_uses, on="publication", how="left", maintain_order="left")
+    used = used.with_columns(pl.col("traversal", "stored", "begun").forward_fill())
+    used = used.join(
+        _ends(flow, traversals.chain, graph, hop, loop),
+        on="publication",
+        how="left",
+        maintain_order="left",
+    )
     read = pl.max_horizontal("start", "stored")
-    cycles = used.sort("time").select(
+    cycles = used.select(
         "start",
         "publish",
         "end",
@@ -112,20 +116,6 @@ def _ages_at(
         cycles = cycles.filter(pl.col("start").is_between(since, last))
         messages = messages.filter(pl.col("stored").is_between(since, last))
     return DataAge(loop, topic, cycles, *_uses(cycles, messages))
-
-
-def _with_used(outputs: pl.DataFrame, messages: pl.DataFrame) -> pl.DataFrame:
-    """Add to each output the message that it used: ``traversal``, ``stored``, ``begun``."""
-    columns = ["traversal", "stored", "begun"]
-    before = latest_before(outputs, messages.select(columns), [], "start", "stored", strictly=True)
-    within = latest_before(outputs, messages, ["tid"], "time", "stored", strictly=True)
-    before, within = (frame.sort("publication") for frame in (before, within))
-    newer = (within["stored"] >= within["start"]).fill_null(False)
-    chosen = before.select(columns).with_columns(
-        pl.when(newer).then(within[column]).otherwise(pl.col(column)).alias(column)
-        for column in columns
-    )
-    return outputs.sort("publication").hstack(chosen)
 
 
 def _ends(

@@ -622,10 +622,21 @@ def _with_assumed_writers(
         "outside its callbacks (from a thread of its own, from Python, or from a service client's"
         " callback): a chain that begins there is measured from the publication"
     )
-    notes = (
-        f"{node} publishes {topic} {regular if number in periods else other}."
-        for node, topic, number in outside.select("node", "topic", "callback_id").iter_rows()
+    followed = outside_publications.join(
+        events.table(tables, "thread_wake").select("pid", "tid").unique(), on=["pid", "tid"]
     )
+    threads = dict(followed.group_by("callback_id").agg(pl.col("tid").first()).iter_rows())
+    notes = []
+    for node, topic, number in outside.select("node", "topic", "callback_id").iter_rows():
+        text = regular if number in periods else other
+        if number in threads:
+            text = (
+                f"from a thread of its own (thread {threads[number]}) that does not sleep for a"
+                " time, or mostly wakes up before it is over: it is paced by data or by another"
+                " thread, and has no period of its own. A chain that begins there is measured from"
+                " the publication"
+            )
+        notes.append(f"{node} publishes {topic} {text}.")
     objects = replace(objects, callbacks=callbacks, notes=(*objects.notes, *notes))
     all_instances = pl.concat([instances, assumed_instances], how="diagonal").select(
         instances.columns

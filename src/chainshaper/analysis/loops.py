@@ -11,7 +11,8 @@ sleep and wakes up (`thread_sleep`, `thread_wake`).
 * **In Python** no event shows where a callback ends. What is published again, turns after the
   message that its thread took last, is not that callback's: a loop publishes it.
 * **A loop that is paced by data** mostly wakes up before the time for which it wanted to sleep, or
-  waits without one. Its publications count as those of a thread that no sleep explains.
+  waits without one. Its publications count as those of a thread that no sleep explains; a note
+  says so.
 * **A named loop** (`loop_named`) may publish nothing, as one that writes to hardware. The end of
   each of its turns counts as a publication on ``NODE:end``, so that a chain can end there.
 
@@ -175,8 +176,8 @@ def _outside(placed: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
 def _loops(
     outside: pl.DataFrame, turns: pl.DataFrame, tables: events.EventTables, objects: Objects
 ) -> tuple[list[_Loop], list[str]]:
-    """Find the loops, and say which threads that publish in turns are none."""
-    loops, notes = _named_loops(outside, turns, tables, objects), list[str]()
+    """Find the loops, and say where one thread, or one node, has several of them."""
+    loops, notes = _named_loops(outside, turns, tables, objects)
     taken_over = {(loop.pid, loop.node, tid) for loop in loops for tid in loop.tids}
     for pid, node, topics in _published_together(outside, taken_over):
         written = outside.filter(pl.col("topic").is_in(topics), pid=pid, node=node)
@@ -184,12 +185,6 @@ def _loops(
         of_topics = turns.filter(pl.col("turn").is_in(written["turn"].implode()))
         if _timed_share(of_topics) >= _TIMED_SHARE:
             loops.append(_Loop(pid, node, topics, tids))
-            continue
-        notes.append(
-            f"{node} publishes {', '.join(topics)} from a thread of its own (thread"
-            f" {', '.join(map(str, tids))}) that wakes up before its time to sleep is over: it is"
-            " paced by data, so it has no period of its own."
-        )
     for tid, together in _of_thread(loops).items():
         if len(together) > 1:
             texts = "; ".join(", ".join(loop.topics) for loop in together)
@@ -202,9 +197,9 @@ def _loops(
 
 def _named_loops(
     outside: pl.DataFrame, turns: pl.DataFrame, tables: events.EventTables, objects: Objects
-) -> list[_Loop]:
-    """Find the loops that the user named, one for each thread."""
-    loops = []
+) -> tuple[list[_Loop], list[str]]:
+    """Find the loops that the user named, one for each thread, and say where a node has several."""
+    loops, notes = list[_Loop](), list[str]()
     named = named_loops(tables, objects.nodes).drop("valid_from").unique(maintain_order=True)
     for pid, tid, node, is_thread in named.iter_rows():
         of_process = turns.filter(pid=pid)
@@ -215,7 +210,13 @@ def _named_loops(
         for thread in tids:
             topics = outside.filter(pid=pid, tid=thread, node=node)["topic"].cast(pl.String)
             loops.append(_Loop(pid, node, tuple(topics.unique().sort()), (thread,), named=True))
-    return list(dict.fromkeys(loops))
+        if len(tids) > 1:
+            notes.append(
+                f"the loop of {node} was named by its node, and {len(tids)} threads of its process"
+                f" sleep for a time ({', '.join(map(str, tids))}): each counts as a loop of it."
+                " Name the thread instead."
+            )
+    return list(dict.fromkeys(loops)), notes
 
 
 _Topics: TypeAlias = tuple[int, str, tuple[str, ...]]
