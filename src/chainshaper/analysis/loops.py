@@ -165,8 +165,8 @@ def _outside(placed: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
     """
     assumed = pl.lit(instances["assumed"]).gather("instance").fill_null(False)
     placed = placed.with_columns(assumed=assumed)
-    repeated = placed.filter("assumed").group_by("instance", "publisher")
-    repeated = repeated.agg(turns=pl.col("turn").n_unique()).filter(pl.col("turns") > 1)
+    by_callback = placed.filter("assumed").group_by("instance", "publisher")
+    repeated = by_callback.agg(turns=pl.col("turn").n_unique()).filter(pl.col("turns") > 1)
     by_loop = pl.col("assumed") & pl.col("publisher").is_in(repeated["publisher"].implode())
     internal = pl.col("topic").cast(pl.String).is_in(sorted(INTERNAL_TOPICS))
     outside = (pl.col("instance").is_null() | by_loop) & ~internal & pl.col("node").is_not_null()
