@@ -128,6 +128,108 @@ int rmw_wait(void *a, void *b, void *c, void *d, void *e, void *f, const uint64_
 """
 """An RMW waits by a condition variable, which is no sleep of the thread's own."""
 
+STRANGE_CALLS = r"""
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <errno.h>
+#include <limits.h>
+#include <poll.h>
+#include <pthread.h>
+#include <signal.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <sys/epoll.h>
+#include <sys/select.h>
+#include <sys/timerfd.h>
+#include <time.h>
+#include <unistd.h>
+
+typedef void (*event)(uint64_t, uint64_t, uint64_t, uint64_t, uint64_t);
+static pthread_mutex_t mutex = PTHREAD_MUTEX_INITIALIZER;
+static pthread_cond_t condition = PTHREAD_COND_INITIALIZER;
+static void publish(void) {
+  event function = (event)dlsym(RTLD_DEFAULT, "ros_trace_rcl_publish");
+  if (function) function(0x50, 1, 0, 0, 0);
+}
+static void create_node(void) {
+  event function = (event)dlsym(RTLD_DEFAULT, "ros_trace_rcl_node_init");
+  if (function) function(1, 2, (uintptr_t)"actor", (uintptr_t)"/robot", 0);
+}
+static void on_alarm(int number) { (void)number; }
+static void on_end(void *name) { printf("%s ends, errno %d\n", (const char *)name, errno); }
+#define SHOW(call) do { \
+    errno = 77; \
+    long result = (long)(call); \
+    printf("%s: %ld, errno %d\n", #call, result, errno); \
+  } while (0)
+#define TIME(seconds, rest) (&(struct timespec){seconds, rest})
+#define TIMEVAL(seconds, rest) (&(struct timeval){seconds, rest})
+#define SHOW_LOCKED(call) do { \
+    pthread_mutex_lock(&mutex); \
+    SHOW(call); \
+    pthread_mutex_unlock(&mutex); \
+  } while (0)
+static void *sleeper(void *unused) {
+  publish();
+  pthread_cleanup_push(on_end, "a sleeper that is cancelled");
+  errno = 77;
+  for (;;) nanosleep(TIME(LONG_MAX, 0), NULL);
+  pthread_cleanup_pop(0);
+  return unused;
+}
+int main(void) {
+  struct epoll_event none;
+  char bytes[8];
+  int waiting = epoll_create1(0), timer = timerfd_create(CLOCK_MONOTONIC, TFD_NONBLOCK);
+  pthread_t thread;
+  create_node();
+  publish();
+  SHOW(nanosleep(TIME(-1, 0), NULL));
+  SHOW(nanosleep(TIME(0, 1000000000), NULL));
+  SHOW(nanosleep(TIME(0, 0), NULL));
+  SHOW(nanosleep(TIME(0, 1000000), NULL));
+  SHOW(clock_nanosleep(1234, 0, TIME(0, 1000), NULL));
+  SHOW(clock_nanosleep(1234, TIMER_ABSTIME, TIME(0, 1000), NULL));
+  SHOW(clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, TIME(-1, 0), NULL));
+  SHOW(clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, NULL, NULL));
+  SHOW(clock_nanosleep(CLOCK_REALTIME, TIMER_ABSTIME, TIME(1, 0), NULL));
+  SHOW(usleep(0));
+  SHOW(sleep(0));
+  SHOW(poll(NULL, 0, 0));
+  SHOW(poll(NULL, 0, 1));
+  SHOW(ppoll(NULL, 0, TIME(-1, 0), NULL));
+  SHOW(epoll_wait(waiting, &none, 0, 1));
+  SHOW(epoll_wait(-1, &none, 1, 1));
+  SHOW(epoll_pwait2(waiting, &none, 1, TIME(0, 2000000000), NULL));
+  SHOW(select(0, NULL, NULL, NULL, TIMEVAL(0, -1)));
+  SHOW(select(0, NULL, NULL, NULL, TIMEVAL(0, 0)));
+  SHOW(select(-1, NULL, NULL, NULL, TIMEVAL(0, 1)));
+  SHOW(read(timer, bytes, 8));
+  SHOW(read(-1, bytes, 8));
+  SHOW(read(1 << 20, bytes, 8));
+  SHOW(timerfd_create(1234, 0));
+  SHOW_LOCKED(pthread_cond_timedwait(&condition, &mutex, TIME(0, -1)));
+  SHOW_LOCKED(pthread_cond_timedwait(&condition, &mutex, TIME(0, 0)));
+  SHOW_LOCKED(pthread_cond_clockwait(&condition, &mutex, 1234, TIME(1, 0)));
+  SHOW_LOCKED(pthread_cond_clockwait(&condition, &mutex, CLOCK_MONOTONIC, TIME(0, -1)));
+  sigaction(SIGALRM, &(struct sigaction){.sa_handler = on_alarm}, NULL);
+  timer_t alarms;
+  timer_create(CLOCK_MONOTONIC, NULL, &alarms);
+  timer_settime(alarms, 0, &(struct itimerspec){{0, 20000000}, {0, 20000000}}, NULL);
+  SHOW(nanosleep(TIME(LONG_MAX, 0), NULL));
+  SHOW(clock_nanosleep(CLOCK_REALTIME, TIMER_ABSTIME, TIME(LONG_MAX, 0), NULL));
+  SHOW(select(0, NULL, NULL, NULL, TIMEVAL(2000000000, 5000000)));
+  SHOW(poll(NULL, 0, -1));
+  timer_delete(alarms);
+  pthread_create(&thread, NULL, sleeper, NULL);
+  usleep(1000);
+  pthread_cancel(thread);
+  pthread_join(thread, NULL);
+  return 0;
+}
+"""
+"""Calls with times that are none, and with times that never come, and what they return."""
+
 
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -155,6 +257,32 @@ def sleeps(traced_run: Traced) -> pl.DataFrame:
     woke = woke.filter(pl.col("call") != 0)
     assert slept["call"].to_list() == woke["call"].to_list()
     return slept.with_columns(woke=woke["time"])
+
+
+def test_calls_return_the_same_as_without_the_library(tmp_path: Path) -> None:
+    """Also errno is the same; and a sleep that is refused is none, and one for ever has no end."""
+    program = tmp_path / "calls"
+    words = ["gcc", "-O1", "-x", "c", "-", "-o", str(program), "-lpthread", "-ldl", "-lrt"]
+    subprocess.run(words, input=STRANGE_CALLS.encode(), check=True)
+
+    def shown() -> list[str]:
+        ran = subprocess.run([program], check=True, timeout=60, capture_output=True, text=True)
+        return ran.stdout.splitlines()
+
+    seen = list[list[str]]()
+
+    def start() -> list[list[str]]:
+        seen.append(shown())
+        return []
+
+    slept = traced(PreloadTracer(tmp_path, ["command"], ()), start).tables
+    assert seen == [shown()]
+    assert len(seen[0]) == 33 and "is cancelled ends" in seen[0][-1]
+    until = slept["thread_sleep"]["until"]
+    assert (until >= 0).all()
+    assert (until == 0).sum() == 4  # nanosleep, clock_nanosleep and poll for ever; the cancelled one
+    woke = slept["thread_wake"].filter(pl.col("call") != 0)
+    assert slept["thread_sleep"].height == woke.height + 1
 
 
 CALLS = {

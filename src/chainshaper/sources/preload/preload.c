@@ -110,6 +110,7 @@ static int descriptor = -1;
 static struct stat identity;  // of the file behind it
 static pthread_key_t at_end;
 static bool has_key;
+static _Atomic bool has_named_node;  // a node whose loop is named was created in this process
 // In a page that the kernel fills with zeros in a child process: 1 while `memory` is this process's.
 static volatile uint32_t *memory_is_ours = &(volatile uint32_t){1};
 struct rseq_area {  // struct rseq of <linux/rseq.h>, which older systems do not have
@@ -323,7 +324,7 @@ static void in_child(void) {
   close_file();
   if (memory) munmap(memory, sizeof(struct memory));
   memory = NULL;
-  refused = false;
+  refused = has_named_node = false;
   if (has_key) pthread_setspecific(at_end, NULL);
   memset(&thread, 0, sizeof thread);
 }
@@ -474,7 +475,6 @@ enum { before_first = FIRST_EVENT - 1, ALL_EVENTS(NUMBER, NUMBER, NUMBER) };
 #define THREAD_NAME 16u  // of the kernel, with the 0 at its end
 static char loops[4096];
 static bool names_threads;
-static _Atomic bool has_named_node;  // a node whose loop is named was created in this process
 
 __attribute__((constructor)) static void read_loops(void) {
   const char *given = getenv(LOOPS);
@@ -651,32 +651,56 @@ TIMER_CALL(rcl_timer_call_with_info)
 enum { SLEEPING_CALLS(CALL_NUMBER) };
 #define NO_SLEEP UINT64_MAX
 
-static uint64_t nanoseconds(const struct timespec *time) {
-  return (uint64_t)time->tv_sec * 1000000000u + (uint64_t)time->tv_nsec;
-}
+#define FOR_EVER UINT64_MAX
+#define LONGEST_SLEEP 4000000000  // s: the times of events have no room for much more
 
+// Times that a program gives may be anything: the kernel refuses some, and that is the program's to
+// see. Whoever calls these keeps errno, which an unknown clock sets.
 static uint64_t in(uint64_t duration) {
+  if (duration == FOR_EVER) return 0;
   return duration ? now(CLOCK_MONOTONIC) + duration : NO_SLEEP;
 }
 
-static uint64_t in_milliseconds(int duration) {
-  return duration < 0 ? 0 : in((uint64_t)duration * 1000000u);
+// A duration of `of_second` parts of a second beside whole ones; 0 if it is none.
+static uint64_t duration(int64_t seconds, int64_t parts, int64_t of_second) {
+  if (seconds < 0 || parts < 0 || parts >= of_second) return 0;
+  if (seconds > LONGEST_SLEEP) return FOR_EVER;
+  return (uint64_t)seconds * 1000000000u + (uint64_t)(parts * (1000000000 / of_second));
 }
 
-static uint64_t in_time(const struct timespec *duration) {
-  return duration ? in(nanoseconds(duration)) : 0;
+static uint64_t in_milliseconds(int time) {
+  return time < 0 ? 0 : in((uint64_t)time * 1000000u);
+}
+
+static uint64_t in_time(const struct timespec *time) {
+  return time ? in(duration(time->tv_sec, time->tv_nsec, 1000000000)) : 0;
+}
+
+static uint64_t in_timeval(const struct timeval *time) {
+  if (!time) return 0;
+  // The C library carries microseconds over, however many there are.
+  return time->tv_usec < 0 ? NO_SLEEP
+                           : in(duration(time->tv_sec + time->tv_usec / 1000000,
+                                         time->tv_usec % 1000000, 1000000));
 }
 
 static uint64_t at(clockid_t clock, const struct timespec *time) {
-  if (clock == CLOCK_MONOTONIC) return nanoseconds(time);
-  return now(CLOCK_MONOTONIC) + (nanoseconds(time) - now(clock));
+  struct timespec there;
+  uint64_t until = time ? duration(time->tv_sec, time->tv_nsec, 1000000000) : 0;
+  if (!until || clock_gettime(clock, &there)) return NO_SLEEP;
+  if (until == FOR_EVER) return 0;
+  if (clock == CLOCK_MONOTONIC) return until;
+  uint64_t passed = (uint64_t)there.tv_sec * 1000000000u + (uint64_t)there.tv_nsec;
+  uint64_t here = now(CLOCK_MONOTONIC);
+  return here + until > passed ? here + until - passed : 1;  // 1: before this machine started
 }
 
 // A condition variable does not say by which clock it waits. The wall clock shows decades, the other
 // one the time since the machine started.
 static uint64_t at_either(const struct timespec *time) {
-  bool of_wall_clock = nanoseconds(time) > now(CLOCK_REALTIME) / 2;
-  return at(of_wall_clock ? CLOCK_REALTIME : CLOCK_MONOTONIC, time);
+  struct timespec wall;
+  clock_gettime(CLOCK_REALTIME, &wall);
+  return at(time && time->tv_sec > wall.tv_sec / 2 ? CLOCK_REALTIME : CLOCK_MONOTONIC, time);
 }
 
 // Whether the sleeps of this thread are recorded. Of the other threads of a process whose node is
@@ -697,9 +721,7 @@ static bool is_followed(int call) {
 
 static bool begin_sleep(int call, uint64_t until) {
   if (until == NO_SLEEP) return false;
-  int before = errno;
   write_record(number_thread_sleep, 0, 2, (uint64_t[6]){until, (uint64_t)call}, true);
-  errno = before;
   return thread.sleeps = true;
 }
 
@@ -710,49 +732,65 @@ static void end_sleep(int call) {
   errno = before;
 }
 
-// `behind`: the function of the C library behind ours. A program that looks for one that its C library
-// does not have finds ours, and is told that the kernel lacks it.
+// `behind_NAME`: the function of the C library behind ours. It is looked up when ours is loaded: these
+// may be called in a signal's handler, where looking up is not allowed. Only what is called still
+// earlier, by a library that is loaded before ours, looks it up itself. A program that looks for a
+// function that its C library does not have finds ours, and is told that the kernel lacks it.
 #define LIBC(type, name, parameters) \
-  static type(*_Atomic behind) parameters; \
-  if (!behind) behind = (type(*) parameters)dlsym(RTLD_NEXT, #name); \
-  if (!behind) return (errno = ENOSYS, (type)-1)
+  static type(*_Atomic behind_##name) parameters; \
+  __attribute__((constructor)) static void find_##name(void) { \
+    behind_##name = (type(*) parameters)dlsym(RTLD_NEXT, #name); \
+  }
+#define IS_MISSING(name) (!behind_##name && (find_##name(), !behind_##name))
 
-#define SLEEPS(type, name, parameters, arguments, call, until) \
+// Whether a sleep is recorded. What the call finds in errno is what the program left there.
+#define BEGINS(call, until) ({ \
+    int before = errno; \
+    bool begins = is_followed(call) && begin_sleep(call, until); \
+    errno = before; \
+    begins; \
+  })
+
+#define SLEEPS(type, name, parameters, arguments, call, until, missing) \
+  LIBC(type, name, parameters) \
   type name parameters { \
-    LIBC(type, name, parameters); \
-    bool recorded = is_followed(sleeps_by_##call) && begin_sleep(sleeps_by_##call, until); \
-    type result = behind arguments; \
+    if (IS_MISSING(name)) return missing; \
+    bool recorded = BEGINS(sleeps_by_##call, until); \
+    type result = behind_##name arguments; \
     if (recorded) end_sleep(sleeps_by_##call); \
     return result; \
   }
+#define FAILS (errno = ENOSYS, -1)
 typedef const struct timespec *time_of;
 SLEEPS(int, clock_nanosleep, (clockid_t clock, int flags, time_of time, struct timespec *rest),
        (clock, flags, time, rest), clock_nanosleep,
-       flags & TIMER_ABSTIME ? at(clock, time) : in_time(time))
-SLEEPS(int, nanosleep, (time_of time, struct timespec *rest), (time, rest), nanosleep, in_time(time))
-SLEEPS(int, usleep, (useconds_t time), (time), nanosleep, in((uint64_t)time * 1000u))
-SLEEPS(unsigned, sleep, (unsigned time), (time), nanosleep, in((uint64_t)time * 1000000000u))
+       flags & TIMER_ABSTIME ? at(clock, time) : in_time(time), ENOSYS)
+SLEEPS(int, nanosleep, (time_of time, struct timespec *rest), (time, rest), nanosleep, in_time(time),
+       FAILS)
+SLEEPS(int, usleep, (useconds_t time), (time), nanosleep, in((uint64_t)time * 1000u), FAILS)
+SLEEPS(unsigned, sleep, (unsigned time), (time), nanosleep, in((uint64_t)time * 1000000000u),
+       time)
 SLEEPS(int, pthread_cond_clockwait,
        (pthread_cond_t *condition, pthread_mutex_t *mutex, clockid_t clock, time_of time),
-       (condition, mutex, clock, time), pthread_cond_clockwait, at(clock, time))
+       (condition, mutex, clock, time), pthread_cond_clockwait, at(clock, time), ENOSYS)
 SLEEPS(int, poll, (struct pollfd *files, nfds_t count, int time), (files, count, time), poll,
-       in_milliseconds(time))
+       in_milliseconds(time), FAILS)
 SLEEPS(int, ppoll, (struct pollfd *files, nfds_t count, time_of time, const sigset_t *signals),
-       (files, count, time, signals), poll, in_time(time))
+       (files, count, time, signals), poll, in_time(time), FAILS)
 SLEEPS(int, epoll_wait, (int file, struct epoll_event *events, int count, int time),
-       (file, events, count, time), epoll_wait, in_milliseconds(time))
+       (file, events, count, time), epoll_wait, in_milliseconds(time), FAILS)
 SLEEPS(int, epoll_pwait,
        (int file, struct epoll_event *events, int count, int time, const sigset_t *signals),
-       (file, events, count, time, signals), epoll_wait, in_milliseconds(time))
+       (file, events, count, time, signals), epoll_wait, in_milliseconds(time), FAILS)
 SLEEPS(int, epoll_pwait2,
        (int file, struct epoll_event *events, int count, time_of time, const sigset_t *signals),
-       (file, events, count, time, signals), epoll_wait, in_time(time))
+       (file, events, count, time, signals), epoll_wait, in_time(time), FAILS)
 SLEEPS(int, select, (int count, fd_set *in_, fd_set *out, fd_set *errors, struct timeval *time),
        (count, in_, out, errors, time), select,
-       time ? in((uint64_t)time->tv_sec * 1000000000u + (uint64_t)time->tv_usec * 1000u) : 0)
+       in_timeval(time), FAILS)
 SLEEPS(int, pselect,
        (int count, fd_set *in_, fd_set *out, fd_set *errors, time_of time, const sigset_t *signals),
-       (count, in_, out, errors, time, signals), select, in_time(time))
+       (count, in_, out, errors, time, signals), select, in_time(time), FAILS)
 
 // Where the interpreter of Python lies in memory: its threads wait by a condition variable for the
 // interpreter's lock, which is no sleep of theirs.
@@ -785,15 +823,21 @@ static bool is_of_interpreter(const void *caller) {
   return (uintptr_t)caller >= interpreter.begin && (uintptr_t)caller < interpreter.end;
 }
 
-int pthread_cond_timedwait(pthread_cond_t *condition, pthread_mutex_t *mutex, time_of time) {
-  static int (*_Atomic behind)(pthread_cond_t *, pthread_mutex_t *, time_of);
+static int (*_Atomic behind_pthread_cond_timedwait)(pthread_cond_t *, pthread_mutex_t *, time_of);
+
+__attribute__((constructor)) static void find_pthread_cond_timedwait(void) {
   // On x86 there are two versions, and dlsym may find the one for programs from before 2003.
-  if (!behind) behind = dlvsym(RTLD_NEXT, "pthread_cond_timedwait", "GLIBC_2.3.2");
-  if (!behind) behind = dlsym(RTLD_NEXT, "pthread_cond_timedwait");
+  void *function = dlvsym(RTLD_NEXT, "pthread_cond_timedwait", "GLIBC_2.3.2");
+  if (!function) function = dlsym(RTLD_NEXT, "pthread_cond_timedwait");
+  behind_pthread_cond_timedwait = (int (*)(pthread_cond_t *, pthread_mutex_t *, time_of))function;
+}
+
+int pthread_cond_timedwait(pthread_cond_t *condition, pthread_mutex_t *mutex, time_of time) {
+  if (IS_MISSING(pthread_cond_timedwait)) return ENOSYS;
   const int call = sleeps_by_pthread_cond_timedwait;
-  bool recorded = is_followed(call) && !is_of_interpreter(__builtin_return_address(0)) &&
-                  begin_sleep(call, at_either(time));
-  int result = behind(condition, mutex, time);
+  const void *caller = __builtin_return_address(0);
+  bool recorded = BEGINS(call, is_of_interpreter(caller) ? NO_SLEEP : at_either(time));
+  int result = behind_pthread_cond_timedwait(condition, mutex, time);
   if (recorded) end_sleep(call);
   return result;
 }
@@ -801,9 +845,10 @@ int pthread_cond_timedwait(pthread_cond_t *condition, pthread_mutex_t *mutex, ti
 // Files of timers, as bits; a bit stays when its file is closed, so the kernel is asked as well.
 static _Atomic uint64_t timer_files[64];
 
+LIBC(int, timerfd_create, (int clock, int flags))
 int timerfd_create(int clock, int flags) {
-  LIBC(int, timerfd_create, (int, int));
-  int file = behind(clock, flags);
+  if (IS_MISSING(timerfd_create)) return FAILS;
+  int file = behind_timerfd_create(clock, flags);
   if (file >= 0 && file < 64 * 64) timer_files[file / 64] |= UINT64_C(1) << file % 64;
   return file;
 }
@@ -818,11 +863,12 @@ static bool is_timer(int file) {
   return sleeps;
 }
 
+LIBC(ssize_t, read, (int file, void *buffer, size_t size))
 ssize_t read(int file, void *buffer, size_t size) {
-  LIBC(ssize_t, read, (int, void *, size_t));
+  if (IS_MISSING(read)) return FAILS;
   const int call = sleeps_by_timerfd;
-  bool recorded = is_timer(file) && is_followed(call) && begin_sleep(call, 0);
-  ssize_t result = behind(file, buffer, size);
+  bool recorded = is_timer(file) && BEGINS(call, 0);
+  ssize_t result = behind_read(file, buffer, size);
   if (recorded) end_sleep(call);
   return result;
 }
@@ -833,15 +879,15 @@ struct duration {  // rmw_time_t
 };
 
 static uint64_t until_work(const struct duration *time) {
-  if (!time || time->seconds > 1000000000u) return 0;  // for ever
+  if (!time || time->seconds > LONGEST_SLEEP) return 0;  // for ever
   return in(time->seconds * 1000000000u + time->nanoseconds);
 }
 
 int rmw_wait(void *subscriptions, void *conditions, void *services, void *clients, void *events,
              void *set, const struct duration *time) {
   BEHIND(rmw_wait, void *, void *, void *, void *, void *, void *, const struct duration *);
-  bool recorded = (thread.publishes || thread.is_named) && is_followed(sleeps_by_rmw_wait) &&
-                  begin_sleep(sleeps_by_rmw_wait, until_work(time));
+  bool recorded =
+    (thread.publishes || thread.is_named) && BEGINS(sleeps_by_rmw_wait, until_work(time));
   int result = behind(subscriptions, conditions, services, clients, events, set, time);
   if (recorded) end_sleep(sleeps_by_rmw_wait);
   return result;
