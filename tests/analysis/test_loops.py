@@ -130,7 +130,7 @@ def python_loop(*, sleeps: bool) -> Story:
     cmd = story.publisher(node, "/cmd")
     if sleeps:
         first_sleep(story, 40, 99)
-    for number, woke in enumerate(range(100, 900, 100)):
+    for number, woke in enumerate(range(100, 1300, 100)):
         if number % 2 == 0:
             story.runs(timer, woke - 50, woke - 48, writes=((sensor, woke - 49),))
             story.take(reader, woke + 2, woke - 49, LOOP)
@@ -144,8 +144,31 @@ def python_loop(*, sleeps: bool) -> Story:
 def test_a_python_loop_that_is_faster_than_its_input_has_a_cycle_for_each_message(
     sleeps: bool,
 ) -> None:
-    expected = [(woke - 50, woke + 10) for woke in range(100, 900, 200)]
+    expected = [(woke - 50, woke + 10) for woke in range(100, 1300, 200)]
     assert latencies(python_loop(sleeps=sleeps), "/a../cmd") == expected
+
+
+@pytest.mark.parametrize("sleeps", [True, False], ids=["sleeps recorded", "without sleeps"])
+def test_a_python_callback_that_publishes_twice_has_two_rows_for_each_message(sleeps: bool) -> None:
+    """Its executor waits for a time in between; the two come 10 and 15 behind the wake-up."""
+    story = Story()
+    timer, sensor = story.source("/sensor", 10, "/a")
+    node = story.node("/actor", PID)
+    reader = story.subscription(node, "/a", callbackless=True)
+    out = story.publisher(node, "/out")
+    if sleeps:
+        first_sleep(story, 40, 99)
+    wakes = range(100, 1300, 100)
+    for woke in wakes:
+        story.runs(timer, woke - 50, woke - 48, writes=((sensor, woke - 49),))
+        story.take(reader, woke + 2, woke - 49, LOOP)
+        if sleeps:
+            turn(story, woke, woke + 50, woke + 99, call=RMW_WAIT)
+        for later in (10, 15):
+            story.publish(out, woke + later, LOOP)
+    expected = [(woke - 50, woke + later) for woke in wakes for later in (10, 15)]
+    assert latencies(story, "/a../out") == expected
+    assert "loop" not in data_flow(story.tables()).objects.callbacks["kind"].to_list()
 
 
 def test_the_first_message_that_a_python_loop_takes_is_not_its_callbacks_either() -> None:
@@ -157,7 +180,7 @@ def test_the_first_message_that_a_python_loop_takes_is_not_its_callbacks_either(
     graph = graph_of(data_flow(story.tables()))
     (reader,) = (c for c in graph.callbacks if c.topic == "/a")
     assert reader.passes_on == ("/cmd",)
-    expected = [(woke - 50, woke + 10) for woke in range(100, 900, 200)]
+    expected = [(woke - 50, woke + 10) for woke in range(100, 1300, 200)]
     assert latencies(story, "/a../cmd") == expected
 
 
@@ -259,6 +282,27 @@ def test_a_loop_that_is_woken_before_its_time_is_paced_by_data() -> None:
     assert flow.objects.callbacks["kind"].to_list() == ["unknown"]
     (note,) = flow.notes
     assert "/driver publishes /points" in note and str(LOOP) in note and "paced by data" in note
+
+
+def test_a_driver_that_blocks_on_its_device_and_then_sleeps_for_a_moment_is_no_loop() -> None:
+    """It is awake for 90 of 100 and computes for 5: a chain begins when it has published."""
+    story = Story()
+    out = story.publisher(story.node("/driver", PID), "/points")
+    drives, after = story.relay("/filter", 30, "/points", "/filtered")
+    first_sleep(story, 90, 99)
+    for woke in range(100, 1300, 100):
+        used = woke // 20
+        story.event("thread_wake", woke, PID, LOOP, call=NANOSLEEP, thread_time=used)
+        story.publish(out, woke + 88, LOOP)
+        sleep = {"until": woke + 99, "call": NANOSLEEP, "thread_time": used + 5}
+        story.event("thread_sleep", woke + 90, PID, LOOP, **sleep)
+        story.runs(drives, woke + 92, woke + 95, reads=woke + 88, writes=((after, woke + 94),))
+    flow = data_flow(story.tables())
+    assert "loop" not in flow.objects.callbacks["kind"].to_list()
+    assert any("paced by data" in note and str(LOOP) in note for note in flow.notes)
+    assert latencies(story, "/points../filtered") == [
+        (woke + 88, woke + 94) for woke in range(100, 1300, 100)
+    ]
 
 
 def test_a_sleep_that_ends_a_little_early_is_one_for_a_time() -> None:

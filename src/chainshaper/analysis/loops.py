@@ -11,7 +11,7 @@ sleep and wakes up (`thread_sleep`, `thread_wake`).
 * **In Python** no event shows where a callback ends. What is published again, turns after the
   message that its thread took last, is not that callback's: a loop publishes it.
 * **A loop that is paced by data** mostly wakes up before the time for which it wanted to sleep, or
-  waits without one. Its publications count as those of a thread that no sleep explains; a note
+  waits without one, or neither sleeps nor computes for most of its period. Its publications count as those of a thread that no sleep explains; a note
   says so.
 * **A named loop** (`loop_named`) may publish nothing, as one that writes to hardware. The end of
   each of its turns counts as a publication on ``NODE:end``, so that a chain can end there.
@@ -38,6 +38,7 @@ from chainshaper.values.event_declarations import SLEEPING_CALLS
 
 _THREAD = ["pid", "tid"]
 _TIMED_SHARE = 0.5  # of a loop's turns: so many must begin when the time to sleep was over
+_BLOCKED = 0.5  # share of its period that a loop waits at most, awake and without computing
 _EARLY = 0.05  # share of a sleep by which it may end early: not every middleware's clock is ours
 _FOR_A_TIME = [SLEEPING_CALLS.index(name) for name in ("clock_nanosleep", "nanosleep", "timerfd")]
 """Calls by which a thread can only sleep, not wait for something."""
@@ -176,7 +177,7 @@ def _without_repeats(
     of_loops = [
         publisher
         for publisher in in_turns.filter(pl.col("count") > 1)["publisher"].unique().sort()
-        if _timed_share(_turns_in(turns, placed.filter(publisher=publisher))) >= _TIMED_SHARE
+        if _is_paced_by_time(_turns_in(turns, placed.filter(publisher=publisher)))
     ]
     by_loop = pl.col("publisher").is_in(of_loops) & assumed
     columns = ("instance", "callback_id")
@@ -206,7 +207,7 @@ def _loops(
     for pid, node, topics in _published_together(outside, taken_over):
         written = outside.filter(pl.col("topic").is_in(topics), pid=pid, node=node)
         tids = tuple(written["tid"].unique().sort())
-        if _timed_share(_turns_in(turns, written)) >= _TIMED_SHARE:
+        if _is_paced_by_time(_turns_in(turns, written)):
             loops.append(_Loop(pid, node, topics, tids))
     for tid, together in _of_thread(loops).items():
         if len(together) > 1:
@@ -266,6 +267,20 @@ def _published_together(
     for (pid, node), sets_of_topics in sorted(groups.items()):
         for topics in sorted(tuple(sorted(topics)) for topics in sets_of_topics):
             yield pid, node, topics
+
+
+def _is_paced_by_time(turns: pl.DataFrame) -> bool:
+    """Return whether turns begin when the time to sleep is over, and mostly compute.
+
+    A driver may sleep for a moment and block on its device for the rest of the time: then it
+    neither computes nor sleeps during most of its period.
+    """
+    waited = turns.sort("start").select(
+        blocked=(pl.col("end") - pl.col("start") - pl.col("execution_ns")).median(),
+        period=pl.col("start").diff().median(),
+    )
+    is_blocked = waited.select(pl.col("blocked") > _BLOCKED * pl.col("period")).item()
+    return not is_blocked and _timed_share(turns) >= _TIMED_SHARE
 
 
 def _timed_share(turns: pl.DataFrame) -> float:

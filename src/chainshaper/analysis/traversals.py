@@ -29,8 +29,8 @@ message again. These repeats are no traversals: they are older data
 publishes, uses them at once.
 
 **One row per data flow.** An instance that publishes a topic twice makes two traversals, with
-the same start. In Python no event shows where a callback ends, so of what is published behind a
-take only the first counts.
+the same start. In Python no event shows where a callback ends. Where publications are as regular as
+those of a loop, whenever messages come, only the first one behind a take counts.
 
 **A standby.** While a shaping node is not there, its standby publishes the chain's output: the
 traversal goes on with the standby's instance.
@@ -48,6 +48,7 @@ import polars as pl
 
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.graph import MESSAGE_FILTER, goes_on_elsewhere, graph_of, readers
+from chainshaper.analysis.loops import seems_regular
 from chainshaper.analysis.matching import by_number, first_after, in_order, latest_before
 from chainshaper.analysis.messages import (
     discarded_instances,
@@ -206,18 +207,15 @@ def _publish(
     """
     for_hop = pl.col("callback_id").is_in(callbacks) & (pl.col("topic") == topic)
     published = flow.publications.lazy().filter(for_hop & pl.col("instance").is_not_null())
-    inside = published.select("instance", "publication").collect()
-    endless, notes = flow.instances["assumed"] & flow.instances["end"].is_null(), list[str]()
-    if endless.any():
-        is_first = pl.col("instance").is_first_distinct()
-        first_alone = inside.filter(is_first | ~pl.lit(endless).gather("instance"))
-        if repeats := inside.height - first_alone.height:
-            notes.append(
-                f"{repeats} messages on {topic} were published behind the first one after a take,"
-                " without callback events (Python): they count as repeats of older data, not as"
-                " cycles."
-            )
-        inside = first_alone
+    inside = published.select("instance", "publication", "time").collect()
+    inside, repeats = _first_behind_takes(flow, inside)
+    notes = list[str]()
+    if repeats:
+        notes.append(
+            f"{repeats} messages on {topic} were published regularly, also without a new message,"
+            " and no event shows where callbacks end (Python): they count as repeats of older data,"
+            " not as cycles."
+        )
     instance, publication = f"instance_{hop}", f"publication_{hop}"
     first = by_number(inside, "instance", "publication", flow.instances.height)
     if first.count() == inside.height:
@@ -227,6 +225,21 @@ def _publish(
         state = state.join(numbers, on=instance, how="left", maintain_order="left")
     state = state.with_columns(pl.lit(False).alias(f"sibling_{hop}"))
     return state, notes
+
+
+def _first_behind_takes(flow: DataFlow, inside: pl.DataFrame) -> tuple[pl.DataFrame, int]:
+    """Leave out what a Python loop published again behind a take, and count it.
+
+    No event shows where such an instance ends. That its publications are as regular as those of a
+    loop, whenever messages come, shows that a loop makes them. What a callback publishes comes in
+    bursts, behind each message.
+    """
+    endless = flow.instances["assumed"] & flow.instances["end"].is_null()
+    is_first = inside["instance"].is_first_distinct()
+    is_repeat = ~is_first & endless.gather(inside["instance"])
+    if not is_repeat.any() or not seems_regular(inside["time"].sort().to_numpy()):
+        return inside, 0
+    return inside.filter(~is_repeat), int(is_repeat.sum())
 
 
 def _publish_by_sibling(
