@@ -22,7 +22,7 @@ def behind(
 ) -> list[int]:
     """Latencies behind a slot that begins 1 after the longest latency in time."""
     following = NextCycle(cycle, 1, work, overrun)
-    return latencies_behind_slot(np.array(measured), in_time, 1, following).tolist()
+    return list(latencies_behind_slot(np.array(measured), in_time, 1, following))
 
 
 @pytest.mark.parametrize(
