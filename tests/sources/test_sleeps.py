@@ -280,7 +280,9 @@ def test_calls_return_the_same_as_without_the_library(tmp_path: Path) -> None:
     assert len(seen[0]) == 33 and "is cancelled ends" in seen[0][-1]
     until = slept["thread_sleep"]["until"]
     assert (until >= 0).all()
-    assert (until == 0).sum() == 4  # nanosleep, clock_nanosleep and poll for ever; the cancelled one
+    assert (
+        until == 0
+    ).sum() == 4  # nanosleep, clock_nanosleep and poll for ever; the cancelled one
     woke = slept["thread_wake"].filter(pl.col("call") != 0)
     assert slept["thread_sleep"].height == woke.height + 1
 
@@ -391,8 +393,15 @@ for thread in threads: thread.join()
 
 @pytest.mark.parametrize(
     ("name", "said"),
-    [("", "names no loop"), ("a,b", "names no loop"), ("a_name_of_16_bytes", "no thread")],
+    [
+        *((name, "names no loop") for name in ("", " ", "a,b", "/a b", "/a ")),
+        ("a_name_of_18_bytes", "no thread"),
+    ],
 )
 def test_names_that_no_loop_can_have_are_refused(name: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         named_loops.names_text([name])
+
+
+def test_a_threads_name_may_have_a_space() -> None:
+    assert named_loops.names_text(["control loop", "/actor"]) == "control loop,/actor"

@@ -10,9 +10,9 @@ sleep and wakes up (`thread_sleep`, `thread_wake`).
   belong to different loops of one thread: each has the turns in which it published.
 * **In Python** no event shows where a callback ends. What is published again, turns after the
   message that its thread took last, is not that callback's: a loop publishes it.
-* **A loop that is paced by data** mostly wakes up before the time for which it wanted to sleep, or
-  waits without one, or neither sleeps nor computes for most of its period. Its publications count as those of a thread that no sleep explains; a note
-  says so.
+* **A loop that is paced by data** mostly wakes up before the time for which it wanted to sleep,
+  waits without one, or neither sleeps nor computes for most of its period. Its publications count
+  as those of a thread that no sleep explains; a note says so.
 * **A named loop** (`loop_named`) may publish nothing, as one that writes to hardware. The end of
   each of its turns counts as a publication on ``NODE:end``, so that a chain can end there.
 

@@ -25,9 +25,11 @@ def names_text(names: Sequence[str]) -> str:
     Raises InputError: a name is none of a node or a thread, or there are too many.
     """
     for name in names:
-        if not name or "," in name or any(sign.isspace() for sign in name.strip()):
+        is_node = name.startswith("/")
+        has_space = any(sign.isspace() for sign in name if is_node)  # threads' names may have some
+        if not name.strip() or "," in name or has_space:
             raise InputError(f"{name!r} names no loop: give a node (/name) or a thread's name")
-        if not name.startswith("/") and len(name.encode()) > _THREAD_BYTES:
+        if not is_node and len(name.encode()) > _THREAD_BYTES:
             raise InputError(
                 f"no thread can be called {name!r}: the kernel cuts names to {_THREAD_BYTES} bytes"
                 f" (`ps -eLo comm`); to name a node, begin with a slash"
