@@ -667,8 +667,8 @@ def _notes_of_writers(
             text = (
                 f"from a thread of its own (thread {threads[number]}) that does not sleep for a"
                 " time, mostly wakes up before it is over, or waits for something else: it is paced"
-                " by data or by another thread, and has no period of its own. A chain that begins there is measured from"
-                " the publication"
+                " by data or by another thread, and has no period of its own. A chain that begins"
+                " there is measured from the publication"
             )
         else:
             text = (
