@@ -20,6 +20,7 @@ namespace chainshaper::simulation {
 
 struct Thread;
 struct Executor;
+struct Entity;
 
 struct Core {
   explicit Core(const CoreDescription & described)
@@ -57,6 +58,8 @@ enum class Step {
   // Of a thread of DDS:
   receive,
   received,
+  // Of a thread in a loop:
+  begin_instance,
 };
 
 struct Thread {
@@ -82,6 +85,7 @@ struct Thread {
   Publisher * sending{nullptr};      // of a publisher thread
   std::deque<Publisher *> to_send;   // of a publisher thread
   MessageQueue to_receive;           // of a thread of DDS
+  LoopAtWork * loop{nullptr};        // in which it is
   Carried carried;                   // what the message at which it works carries
   std::optional<Nanoseconds> began;  // when it began to send, or its gate woke up
 };
@@ -125,6 +129,13 @@ struct Synchroniser {
   MaybePlace trigger;
 };
 
+// A loop, and what the executor of its process has stored for it.
+struct LoopAtWork {
+  const LoopDescription * description;
+  Entity * entity{nullptr};
+  std::vector<std::optional<Carried>> stored;  // of each input, what its newest message carries
+};
+
 struct Entity {
   const EntityDescription * description;
   Executor * executor;
@@ -134,9 +145,10 @@ struct Entity {
   std::span<Publisher> publishers;
   GateAtWork * gate;
   Synchroniser * synchroniser;
+  LoopAtWork * loop;  // whose entity it is, or for which its callback stores messages
 
   MessageQueue history;
-  Nanoseconds due;    // of a timer
+  Nanoseconds due;    // of a timer or loop
   bool ready{false};  // in the executor's snapshot
 
   bool may_run() const { return group_is_busy == nullptr || !*group_is_busy; }

@@ -73,7 +73,7 @@ def run_in_ros(
     check_cores(application.cores())
     permitted = fifo_permitted(realtime)
     realtime = permitted if realtime is None else realtime
-    period_ns = origin_timer(application)[1].timer_ns or 0
+    period_ns = origin_timer(application)[1].period_ns or 0
     with tempfile.TemporaryDirectory(prefix=f".{output.name}.nodes-", dir=output.parent) as place:
         if plan is not None:
             application = placed_application(application, plan)

@@ -145,7 +145,7 @@ def _checked(
         else:  # a baseline
             application = at_offsets(application, plan)
     timing = timing_of(application, cycles, START_NS)
-    slowest = max((cb.timer_ns or 0) + cb.phase_ns for _, cb in application.callbacks())
+    slowest = max((cb.period_ns or 0) + cb.phase_ns for _, cb in application.callbacks())
     if timing.stop_ns + slowest > LONGEST_NS:
         raise InputError(
             f"{cycles} cycles with the durations of {application.name!r} would end in"
@@ -223,6 +223,10 @@ def _create_objects(system: System) -> tuple[list[live.ProcessLog], Handles]:
     entities = []
     for entity in system.entities:
         log = logs[entity.process]
+        if entity.kind == "loop":
+            log.loop(system.processes[entity.process].node)
+            entities.append((0, 0, 0))
+            continue
         filtered = "message_filters::" if entity.described.synchronises else ""
         node = system.processes[entity.process].node
         callback = log.callback(f"{filtered}{node}::callback{entity.index}")
@@ -278,7 +282,7 @@ def with_recorded_times(
 ) -> Application:
     """Have execution times drawn from a recording of the application, in stretches of ``block``.
 
-    Gates keep what they have: they compute nothing. Callbacks of a node with the same period or
+    Gates and loops keep what they have: they are no callbacks that compute. Callbacks of a node with the same period or
     topic are told apart by the order in which they were registered.
 
     Raises InputError: a callback of the application is not in the recording, or its CPU time is
@@ -316,6 +320,9 @@ def _with_times(
     described = Counter(trigger for callback in node.callbacks for trigger in _triggers(callback))
     before = Counter[_Trigger]()
     for callback in node.callbacks:
+        if callback.loop_ns is not None:
+            yield callback
+            continue
         parts: list[pl.DataFrame] = []
         for trigger in _triggers(callback):
             candidates, place = recorded.get(trigger, ()), before[trigger]

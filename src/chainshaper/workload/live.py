@@ -246,7 +246,7 @@ def _between_releases(application: Application) -> int:
 
 def _sooner(application: Application, cycles: int, timing: Timing) -> Timing:
     """Move a run earlier, by as many whole hyper-periods of its timers as there is time for."""
-    periods = [callback.timer_ns for _, callback in application.callbacks() if callback.timer_ns]
+    periods = [period for _, callback in application.callbacks() if (period := callback.period_ns)]
     hyper_period_ns = math.lcm(*periods)
     spare_ns = max(0, timing.start_ns - LEAD_NS - time.monotonic_ns())
     earlier_ns = spare_ns // hyper_period_ns * hyper_period_ns

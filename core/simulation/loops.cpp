@@ -1,0 +1,60 @@
+// Threads that are in a loop: they sleep, wake up, use what was stored, compute, and publish.
+
+#include "simulation/engine.hpp"
+
+namespace chainshaper::simulation {
+namespace {
+
+constexpr std::int64_t clock_nanosleep = 1;  // as `SLEEPING_CALLS` in event_declarations.py says
+
+}  // namespace
+
+// Begins an instance of the thread's loop, when the thread has slept.
+void Engine::begin_instance(Thread & thread) {
+  log(TracePoint::wake, now_, &thread, {clock_nanosleep, thread.used});
+  use_stored(thread);
+  thread.entity = thread.loop->entity;
+  if (thread.entity->description->starts_chain && now_ >= description_.record_from_ns) {
+    thread.carried.chain_start = now_;
+    thread.carried.instance = started_++;
+  }
+  begin_body(thread);
+}
+
+// Gives the thread what the newest message of each input carries: the stamp of the first, and the
+// chain of the one that is on it.
+void Engine::use_stored(Thread & thread) {
+  const LoopAtWork & loop = *thread.loop;
+  thread.carried = Carried{};
+  thread.carried.origin = now_;
+  for (Place input = 0; input < loop.stored.size(); ++input) {
+    if (!loop.stored[input]) continue;
+    const Carried & carried = *loop.stored[input];
+    if (input == 0) thread.carried.origin = carried.origin;
+    if (!carried.chain_start) continue;
+    thread.carried.chain_start = carried.chain_start;
+    thread.carried.instance = carried.instance;
+  }
+}
+
+// Ends an instance of the thread's loop. The first one that used a message is the reaction to it.
+void Engine::end_instance(Thread & thread) {
+  if (thread.loop->description->ends_chain) note_latency(thread.carried);
+}
+
+// Lets the thread sleep until the first multiple of its period that is not over yet.
+void Engine::fall_asleep(Thread & thread) {
+  const LoopAtWork & loop = *thread.loop;
+  Entity & entity = *loop.entity;
+  const Nanoseconds period = entity.description->period_ns;
+  const Nanoseconds over = now_ - later(entity.due, period);
+  const Nanoseconds missed = over <= 0 ? 0 : (over - 1) / period + 1;
+  entity.due = later(entity.due + missed * period, period);
+  log(TracePoint::sleep, now_, &thread, {entity.due, clock_nanosleep, thread.used});
+  thread.step = Step::begin_instance;
+  if (entity.due == now_) return;  // the call returns at once
+  wait(thread);
+  if (entity.due <= loop.description->last_ns) agenda_.plan(entity.due, SleepOver{&thread});
+}
+
+}  // namespace chainshaper::simulation
