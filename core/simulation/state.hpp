@@ -20,7 +20,7 @@ namespace chainshaper::simulation {
 
 struct Thread;
 struct Executor;
-struct Entity;
+struct LoopAtWork;
 
 struct Core {
   explicit Core(const CoreDescription & described)

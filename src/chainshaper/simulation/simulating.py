@@ -282,8 +282,9 @@ def with_recorded_times(
 ) -> Application:
     """Have execution times drawn from a recording of the application, in stretches of ``block``.
 
-    Gates and loops keep what they have: they are no callbacks that compute. Callbacks of a node with the same period or
-    topic are told apart by the order in which they were registered.
+    Gates keep what they have: they compute nothing. So do loops, which are no callbacks. Callbacks
+    of a node with the same period or topic are told apart by the order in which they were
+    registered.
 
     Raises InputError: a callback of the application is not in the recording, or its CPU time is
     not.

@@ -1,0 +1,256 @@
+"""Loops in the simulator: schedules worked out by hand, and beside a second simulator of loops.
+
+What an instance used is seen by the stamp that it passed on, in the rows of a gate behind it.
+"""
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from loops_by_hand import instances_of
+from schedules import MS, application, begin_of, ran, simulated
+from test_properties import SETTINGS
+
+from chainshaper.simulation import simulate, simulate_latencies
+from chainshaper.simulation.simulating import START_NS
+from chainshaper.values.event_declarations import SLEEPING_CALLS
+from chainshaper.values.recording import Recording
+from chainshaper.workload.description import Application
+from chainshaper.workload.timing import timing_of
+
+CHAIN = """
+chain: /scan../command
+nodes:
+  sensor: {core: 2, callbacks: [{timer: 20ms, publishes: [/scan]}]}
+  controller:
+    core: 3
+    callbacks:
+      - {loop: 8ms, phase: 1ms, core: 1, reads: [/scan], LOOP, publishes: [/command]}
+  seen:
+    core: 4
+    callbacks:
+      - subscription: /command
+        publishes: [/seen]
+        gate: {slots: [[0ms, 1000ms]], cycle: 1000ms}
+"""
+"""Of the loop's multiples, 105 ms is the first in a recording, which begins at 100 ms."""
+
+
+def chain(loop: str = "execution: {constant: 2ms}", **simulation: Any) -> Application:
+    return application(CHAIN.replace("LOOP", loop), **simulation)
+
+
+def of_node(recording: Recording, table: str, node: str) -> pl.DataFrame:
+    (pid,) = (pid for pid, name in recording.info.processes.items() if name == f"/{node}")
+    return recording.events[table].filter(pid=pid)
+
+
+def awake(recording: Recording, node: str = "controller") -> list[tuple[int, int, int]]:
+    """When instances began and ended, and until when the thread slept then (ns)."""
+    begins = of_node(recording, "thread_wake", node)["time"].to_list()
+    sleeps = of_node(recording, "thread_sleep", node).select("time", "until").rows()
+    if sleeps and begins and sleeps[0][0] < begins[0]:
+        sleeps = sleeps[1:]
+    return [(begin, *sleep) for begin, sleep in zip(begins, sleeps, strict=False)]
+
+
+def used(recording: Recording, node: str = "seen") -> dict[int, int]:
+    """The stamp of the message that each instance used, by when it published (ns)."""
+    table = of_node(recording, "gate_release", node)
+    return dict(table.select("source_timestamp", "origin").iter_rows())
+
+
+def in_ms(recording: Recording, *times: int) -> tuple[float, ...]:
+    return tuple((time - begin_of(recording)) / MS for time in times)
+
+
+def test_a_loop_sleeps_until_multiples_of_its_period_and_uses_the_newest_message(
+    tmp_path: Path,
+) -> None:
+    recording = simulated(tmp_path, chain(delivery={"constant": "3ms"}), cycles=2)
+    instances = [in_ms(recording, *times) for times in awake(recording)]
+    assert instances[:4] == [(5, 7, 13), (13, 15, 21), (21, 23, 29), (29, 31, 37)]
+    stamps = [in_ms(recording, *pair) for pair in used(recording).items()]
+    # The scan of 0 is there at 3, that of 20 at 23, when the instance of 21 has begun.
+    assert stamps[:5] == [(7, 0), (15, 0), (23, 0), (31, 20), (39, 20)]
+    (call,) = set(recording.events["thread_sleep"]["call"])
+    assert SLEEPING_CALLS[call] == "clock_nanosleep"
+    assert recording.events["loop_named"].select("name", "is_thread").rows() == [("/controller", 0)]
+    (thread,) = (info for info in recording.info.threads if info.role == "loop")
+    assert (thread.comm, thread.cores, thread.priority) == ("loop", (1,), 80)
+    assert set(of_node(recording, "rmw_publish", "controller")["tid"]) == {thread.tid}
+
+
+@pytest.mark.parametrize(("delivery", "stamp"), [("4999999ns", 0), ("5000001ns", -20)])
+def test_what_is_stored_a_nanosecond_before_an_instance_begins_is_used(
+    tmp_path: Path, delivery: str, stamp: int
+) -> None:
+    recording = simulated(tmp_path, chain(delivery={"constant": delivery}), cycles=2)
+    published, origin = next(iter(used(recording).items()))
+    assert in_ms(recording, published, origin) == (7, stamp)
+
+
+def test_costs_are_those_of_the_loops_thread(tmp_path: Path) -> None:
+    costs = {"wake_up": "500us", "take": "250us", "publish": "1ms"}
+    each = {name: {"constant": cost} for name, cost in costs.items()}
+    loop = "execution: {constant: 2ms}, afterwards: {constant: 1ms}"
+    recording = simulated(tmp_path, chain(loop, **each), cycles=2)
+    # It wakes up from 5 to 5.5, computes until 7.5, publishes until 8.5, and goes on until 9.5.
+    assert in_ms(recording, *awake(recording)[0]) == (5.5, 9.5, 13)
+    assert in_ms(recording, next(iter(used(recording)))) == (7.5,)
+
+
+def test_multiples_that_an_instance_missed_are_left_out(tmp_path: Path) -> None:
+    """Instances before the recording: 1, 9, …, 97 ms are thirteen."""
+    times = [*["1ms"] * 13, "2ms", "11ms", "8ms", "1ms"]
+    loop = f"execution: {{sequence: [{', '.join(times)}]}}"
+    recording = simulated(tmp_path, chain(loop), cycles=3)
+    instances = [in_ms(recording, *times) for times in awake(recording)]
+    assert instances[:3] == [(5, 7, 13), (13, 24, 29), (29, 37, 37)]
+    assert instances[3] == (37, 38, 45)  # its sleep was over before it began
+
+
+@pytest.mark.parametrize(
+    ("priority", "expected"),
+    [
+        (90, [("controller", 4, 5), ("loop", 5, 7), ("controller", 7, 10), ("loop", 13, 15)]),
+        (70, [("controller", 4, 8), ("loop", 8, 10), ("loop", 13, 15)]),
+    ],
+)
+def test_its_thread_has_a_priority_of_its_own(
+    tmp_path: Path, priority: int, expected: list[tuple[str, float, float]]
+) -> None:
+    text = f"""
+    chain: /scan../command
+    nodes:
+      sensor: {{core: 2, callbacks: [{{timer: 20ms, publishes: [/scan]}}]}}
+      controller:
+        callbacks:
+          - {{timer: 20ms, phase: 4ms, execution: {{constant: 4ms}}}}
+          - loop: 8ms
+            phase: 1ms
+            priority: {priority}
+            reads: [/scan]
+            execution: {{constant: 2ms}}
+            publishes: [/command]
+    """
+    recording = simulated(tmp_path, application(text))
+    assert [stretch for stretch in ran(recording) if 4 <= stretch[1] < 16] == expected
+
+
+def test_the_stamp_is_that_of_the_first_topic_that_it_reads(tmp_path: Path) -> None:
+    text = CHAIN.replace("reads: [/scan], LOOP", "reads: [/late, /scan], LOOP")
+    text = text.replace("LOOP", "execution: {constant: 1ms}")
+    text += "  late: {core: 5, callbacks: [{timer: 20ms, phase: 4ms, publishes: [/late]}]}\n"
+    recording = simulated(tmp_path, application(text))
+    stamps = [in_ms(recording, *pair) for pair in used(recording).items()]
+    assert stamps[:3] == [(6, 4), (14, 4), (22, 4)]
+
+
+def test_before_anything_has_arrived_an_instance_stamps_its_message_itself(tmp_path: Path) -> None:
+    """The first scan comes at 165 ms, behind the first recorded instances."""
+    text = CHAIN.replace("timer: 20ms", "timer: 20ms, phase: 165ms")
+    text = text.replace("LOOP", "execution: {constant: 1ms}")
+    text = text.replace("chain: /scan../command", "chain: /tick../tock")
+    text += "  clock: {core: 5, callbacks: [{timer: 20ms, publishes: [/tick]}]}\n"
+    text += "  echo: {core: 5, callbacks: [{subscription: /tick, publishes: [/tock]}]}\n"
+    recording = simulated(tmp_path, application(text))
+    stamps = [in_ms(recording, *pair) for pair in used(recording).items()]
+    assert stamps[0] == (6, 5)
+    assert (70, 65) in stamps or (78, 65) in stamps
+
+
+def test_a_loop_that_reads_nothing_ends_with_the_timers(tmp_path: Path) -> None:
+    text = "{chain: a, nodes: {a: {callbacks: [{loop: 20ms, publishes: [/a]}]}}}"
+    described = application(text)
+    recording = simulate(described, tmp_path / "recording", cycles=3)
+    timing = timing_of(described, 3, START_NS)
+    begins = recording.events["thread_wake"]["time"]
+    assert begins.to_list() == [timing.anchor_ns + 20 * MS * number for number in (5, 6, 7)]
+
+
+def test_the_first_instance_that_used_a_message_is_the_reaction_to_it() -> None:
+    """Scans of 0, 20, 40 and 60 are stored 3 ms later; the loop begins at 5, 29, 45, 69, …"""
+    latencies = simulate_latencies(chain(delivery={"constant": "3ms"}), cycles=4)
+    assert list(latencies) == [7 * MS, 11 * MS, 7 * MS, 11 * MS]
+
+
+def test_of_several_messages_before_an_instance_the_newest_is_used() -> None:
+    text = CHAIN.replace("timer: 20ms", "timer: 4ms").replace("LOOP", "execution: {constant: 1ms}")
+    latencies = simulate_latencies(application(text), cycles=6)
+    # From 20 ms on: scans at 20, 24, 28, …; the loop begins at 25, 33, 41.
+    assert list(latencies) == [-1, 2 * MS, -1, 2 * MS, -1, 2 * MS]
+
+
+# Random applications beside a simulator of loops that is written for nothing else.
+
+NS = st.integers(1, 3_000_000)
+
+
+@st.composite
+def loops(draw: st.DrawFn) -> dict[str, Any]:
+    """Sensors and loops, which may read each other's topics; each thread has a core of its own."""
+    sensors, controllers = draw(st.integers(1, 3)), draw(st.integers(1, 3))
+    topics = [f"/s{number}" for number in range(sensors)]
+    topics += [f"/c{number}" for number in range(controllers)]
+    nodes: dict[str, Any] = {}
+    for number in range(sensors):
+        callback = {
+            "timer": f"{draw(st.integers(4_000_000, 30_000_000))}ns",
+            "phase": f"{draw(NS)}ns",
+            "execution": {"sequence": [f"{draw(NS)}ns" for _ in range(3)]},
+            "publishes": [f"/s{number}"],
+        }
+        nodes[f"s{number}"] = {"core": 10 + number, "callbacks": [callback]}
+    for number in range(controllers):
+        reads = draw(st.lists(st.sampled_from(topics), min_size=1, max_size=3, unique=True))
+        loop = {
+            "loop": f"{draw(st.integers(1_000_000, 15_000_000))}ns",
+            "phase": f"{draw(NS)}ns",
+            "core": 20 + number,
+            "reads": reads,
+            "execution": {"sequence": [f"{3 * draw(NS)}ns" for _ in range(4)]},
+            "publishes": [f"/c{number}"],
+        }
+        nodes[f"c{number}"] = {"core": 30 + number, "callbacks": [loop]}
+        gate = {"slots": [["0ms", "1000s"]], "cycle": "1000s"}
+        seen = {"subscription": f"/c{number}", "publishes": [f"/g{number}"], "gate": gate}
+        nodes[f"g{number}"] = {"core": 40 + number, "callbacks": [seen]}
+    costs = {
+        name: {"constant": f"{draw(st.integers(0, 200_000))}ns"} for name in ("take", "publish")
+    }
+    costs["wake_up"] = {"constant": f"{draw(st.integers(0, 200_000))}ns"}
+    costs["delivery"] = {"constant": f"{draw(NS)}ns"}
+    return {"chain": "/s0", "nodes": nodes, "simulation": {"interrupts": 0.0, **costs}}
+
+
+@SETTINGS
+@given(loops())
+def test_random_loops_are_those_of_a_second_simulator(description: dict[str, Any]) -> None:
+    described = application(yaml.safe_dump(description))
+    cycles = 20
+    with tempfile.TemporaryDirectory() as folder:
+        recording = simulate(described, Path(folder) / "r", cycles=cycles)
+        timing = timing_of(described, cycles, START_NS)
+        # What is under way at the end is in neither.
+        until = timing.stop_ns - 50 * MS
+        expected = instances_of(described, timing)
+        for name in (name for name in described.nodes if name.startswith("c")):
+            stamps = used(recording, name.replace("c", "g"))
+            by_hand = [
+                each
+                for each in expected[name]
+                if each.begin >= timing.record_from_ns and each.end < until
+            ]
+            assert [times for times in awake(recording, name) if times[1] < until] == [
+                (each.begin, each.end, each.until) for each in by_hand
+            ]
+            assert [(each.published, stamps[each.published]) for each in by_hand] == [
+                (each.published, each.stamp) for each in by_hand
+            ]
+            assert by_hand
