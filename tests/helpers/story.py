@@ -40,7 +40,9 @@ class Story:
     rows: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
     next_handle: int = 0x1000
 
-    def event(self, name: str, time: int, pid: int, tid: int | None = None, **fields: Any) -> None:
+    def event(
+        self, name: str, /, time: int, pid: int, tid: int | None = None, **fields: Any
+    ) -> None:
         row = {"time": time, "pid": pid, "tid": pid if tid is None else tid, **fields}
         self.rows.setdefault(name, []).append(row)
 

@@ -14,9 +14,12 @@ For these, instances are assumed (column ``assumed``; they have no ``end`` and n
 * The callback of a service's client, and what an action's client and server do, begin with the
   take as well. They end when the thread's executor looks for work again. Where an event shows
   that, they have an end, and are not ``assumed``.
+* A loop in a thread of its own, of which events show when it sleeps, has an instance for each of its
+  turns (:mod:`~chainshaper.analysis.loops`). These are not ``assumed``: they have an end.
 * A driver's thread, a player of recorded data, or a Python timer without `rcl_timer_call` publishes
   outside all callbacks that events show. A topic that its node publishes only like this gets a
-  callback of kind ``unknown``, with the handle 0 and one instance per publication.
+  callback with the handle 0 and one instance per publication. Its kind is ``loop`` where the
+  publications are regular and the node is one of rclcpp, else ``unknown``.
 """
 
 from collections.abc import Collection, Iterator
@@ -30,6 +33,7 @@ from chainshaper.analysis.contradictions import (
     contradictions,
     with_shown_periods,
 )
+from chainshaper.analysis.loops import NO_TURNS, regular_period, seems_regular, with_loops
 from chainshaper.analysis.lost_ends import LOOKS, without_disproved_ends
 from chainshaper.analysis.matching import by_number, ends_of_starts, first_after, latest_before
 from chainshaper.analysis.messages import (
@@ -73,6 +77,9 @@ class DataFlow:
         The frame of :func:`~chainshaper.analysis.messages.takes`, and two columns:
         ``publication`` that was taken (null: not known);
         ``instance`` that got the message (null: none did).
+    ``turns``
+        Of the instances of loops, when they were due, and whether they overran
+        (:class:`~chainshaper.analysis.loops.FlowWithLoops`).
     ``events``
         The tables that all this came from.
     ``notes``
@@ -94,6 +101,7 @@ class DataFlow:
     notes: tuple[str, ...]
     contradictions: tuple[Contradiction, ...] = ()
     without_takes: frozenset[int] = frozenset()
+    turns: pl.DataFrame = field(default_factory=NO_TURNS.clear)
     followed: pl.DataFrame = field(default_factory=FOLLOWED.to_frame)
 
 
@@ -147,7 +155,10 @@ def data_flow(
         published = _begun_outside(published, instances)
     if sent.height and received.height:
         published = _answered(published, taken)
-    objects, instances, published = _with_assumed_writers(objects, instances, published)
+    looping = with_loops(objects, instances, published, tables)
+    objects, instances, published = _with_assumed_writers(
+        looping.objects, looping.instances, looping.published, tables
+    )
     published = with_departures(published, tables, objects)
     seen = contradictions(
         tables=tables,
@@ -175,6 +186,7 @@ def data_flow(
         notes=notes,
         contradictions=seen,
         without_takes=without_takes,
+        turns=looping.turns,
         followed=followed,
     )
     flow = _with_restarts(flow)  # which knows a timer again by its declared period
@@ -492,7 +504,9 @@ def _with_restarts(flow: DataFlow) -> DataFlow:
     known = flow.objects.callbacks.unique("callback_id", keep="first", maintain_order=True)
     known = known.join(writes, on="callback_id", how="left", maintain_order="left")
     known = known.join(flow.followed, on=["node", "pid"], how="left", maintain_order="left")
-    outside = (pl.col("kind") == "unknown") & (pl.col("handle") == 0)
+    outside = pl.col("kind").is_in(["unknown", "loop"]) & (pl.col("handle") == 0)
+    # A loop's period is measured: it is not the same number in the next process.
+    known = known.with_columns(period_ns=pl.when(pl.col("kind") != "loop").then("period_ns"))
     of = pl.when(outside).then(pl.col("wrote").cast(pl.String)).otherwise("topic")
     known = known.with_columns(pl.coalesce("last_pid", "pid"), of=of)
     runs_last = pl.col("pid") == pl.col("last_pid")
@@ -551,7 +565,10 @@ def _begun_outside(published: pl.DataFrame, instances: pl.DataFrame) -> pl.DataF
 
 
 def _with_assumed_writers(
-    objects: Objects, instances: pl.DataFrame, published: pl.DataFrame
+    objects: Objects,
+    instances: pl.DataFrame,
+    published: pl.DataFrame,
+    tables: events.EventTables,
 ) -> tuple[Objects, pl.DataFrame, pl.DataFrame]:
     """Add a callback, and instances, for each topic that is published only outside callbacks.
 
@@ -584,22 +601,54 @@ def _with_assumed_writers(
         )
         for column in columns
     )
+    periods = _periods_of_writers(outside_publications, objects, tables)
+    period = pl.col("callback_id").replace_strict(periods, default=None, return_dtype=pl.Int64)
     new = outside.select(
         *("pid", "valid_from", "callback_id"),
         node=pl.col("node").cast(pl.String),
-        kind=pl.lit("unknown"),
+        kind=pl.when(period.is_null()).then(pl.lit("unknown")).otherwise(pl.lit("loop")),
+        period_ns=period,
         handle=pl.lit(0, dtype=pl.UInt64),
         observed=pl.lit(False),
     )
     callbacks = pl.concat([objects.callbacks, new], how="diagonal_relaxed").cast(CALLBACK_SCHEMA)  # type: ignore[arg-type]
+    regular = (
+        "regularly from a thread of its own, which counts as a loop. No event shows its sleep"
+        " (`record --source preload` sees it): each of its instances is known by its publication"
+        " alone, so its response time, its overruns, and what it read while it computed are not"
+        " known"
+    )
+    other = (
+        "outside its callbacks (from a thread of its own, from Python, or from a service client's"
+        " callback): a chain that begins there is measured from the publication"
+    )
     notes = (
-        f"{node} publishes {topic} outside its callbacks (from a thread of its own, from Python, "
-        "or from a service client's callback): a chain that begins there is measured from the "
-        "publication."
-        for node, topic in outside.select("node", "topic").iter_rows()
+        f"{node} publishes {topic} {regular if number in periods else other}."
+        for node, topic, number in outside.select("node", "topic", "callback_id").iter_rows()
     )
     objects = replace(objects, callbacks=callbacks, notes=(*objects.notes, *notes))
     all_instances = pl.concat([instances, assumed_instances], how="diagonal").select(
         instances.columns
     )
     return objects, all_instances, published
+
+
+def _periods_of_writers(
+    written: pl.DataFrame, objects: Objects, tables: events.EventTables
+) -> dict[int, int]:
+    """Map the callbacks of threads that publish regularly, as a loop does, to their periods (ns).
+
+    Nodes of rclpy are left out, whose timers publish outside callbacks as well; and threads of which
+    events of sleeps show that they are no loops.
+    """
+    in_cpp = objects.callbacks.filter("observed").select("pid", "node").unique()
+    sleeping = events.table(tables, "thread_wake").select("pid", "tid").unique()
+    written = written.with_columns(pl.col("node").cast(pl.String))
+    written = written.join(in_cpp, on=["pid", "node"], how="semi", maintain_order="left")
+    written = written.join(sleeping, on=["pid", "tid"], how="anti", maintain_order="left")
+    periods = {}
+    for (number,), rows in written.group_by("callback_id", maintain_order=True):
+        times = rows["time"].sort().to_numpy()
+        if rows["tid"].n_unique() == 1 and seems_regular(times):
+            periods[int(str(number))] = regular_period(times) or 0
+    return periods

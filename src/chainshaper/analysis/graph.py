@@ -12,7 +12,8 @@ callback and published in another of the same node:
   are its inputs when each of them ran as often as X was published: ``Callback.in_turns``.
 * **An action's goal** leads to the feedback that its server's node publishes next.
 * **Stored messages**: in a node whose subscription callbacks publish nothing at all, but whose
-  timers do, a subscription callback stores its message for the timers.
+  timers or loops do, a subscription callback stores its message for these. A loop that the user
+  named also reads what such callbacks of other nodes of its process stored.
 
 All of these are inferences. A topic that only another callback publishes for this one stands in
 ``Callback.publishes`` and also in ``passes_on``.
@@ -28,7 +29,13 @@ import polars as pl
 from chainshaper.analysis.flow import DataFlow, data_flow
 from chainshaper.analysis.objects import endpoints
 from chainshaper.values import events
-from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Callback, Node
+from chainshaper.values.application import (
+    INTERNAL_TOPICS,
+    LOOP_END,
+    ApplicationGraph,
+    Callback,
+    Node,
+)
 
 MESSAGE_FILTER = "message_filters::"
 """This stands in the symbols of callbacks that message_filters registered."""
@@ -63,11 +70,16 @@ def graph_of(flow: DataFlow) -> ApplicationGraph:
     for callback in callbacks:
         of_node[callback.pid, callback.node].append(callback)
     turns = _in_turns(flow, of_node.values())
+    named_loops = defaultdict[int, list[Callback]](list)
+    for callback in callbacks:
+        if is_named_loop(callback):
+            named_loops[callback.pid].append(callback)
     created = flow.objects.nodes.select("node", "pid").unique(maintain_order=True).iter_rows()
     nodes = dict.fromkeys((node, last.get((node, pid), pid)) for node, pid in created)
     complete = []
     for callback in callbacks:
-        passed = _passed_on(callback, of_node[callback.pid, callback.node])
+        siblings = of_node[callback.pid, callback.node]
+        passed = _passed_on(callback, siblings, named_loops[callback.pid])
         sets = ({*callback.publishes, *passed}, passed, turns[callback.id])
         publishes, passes_on, in_turns = (tuple(sorted(topics)) for topics in sets)
         complete.append(
@@ -81,8 +93,30 @@ def graph_of(flow: DataFlow) -> ApplicationGraph:
     )
 
 
-def _passed_on(callback: Callback, siblings: list[Callback]) -> set[str]:
-    """Return the topics that other callbacks of its node publish for a callback."""
+def is_named_loop(callback: Callback) -> bool:
+    """Return whether a callback is a loop that the user named: its instances' ends are messages."""
+    return callback.kind == "loop" and callback.node + LOOP_END in callback.publishes
+
+
+def readers(graph: ApplicationGraph, callback: Callback, topic: str) -> list[Callback]:
+    """Return the timers and loops that publish ``topic`` from what ``callback`` stored."""
+    return [
+        reader
+        for reader in graph.callbacks
+        if reader.kind in ("timer", "loop")
+        and topic in reader.publishes
+        and reader.pid == callback.pid
+        and (reader.node == callback.node or is_named_loop(reader))
+    ]
+
+
+def _passed_on(
+    callback: Callback, siblings: list[Callback], named_loops: list[Callback]
+) -> set[str]:
+    """Return the topics that other callbacks of its node publish for a callback.
+
+    ``named_loops`` are those of its process.
+    """
     published_itself = set(callback.publishes)
     if callback.kind == "service":  # an action's: a thread of the goal publishes as a rule
         action, goal, _ = (callback.topic or "").partition("/_action/send_goal")
@@ -91,7 +125,8 @@ def _passed_on(callback: Callback, siblings: list[Callback]) -> set[str]:
     if callback.kind != "subscription" or callback.topic in {None, *INTERNAL_TOPICS}:
         return set()
     if not _outputs(siblings, "subscription"):
-        return _outputs(siblings, "timer")
+        of_siblings = _outputs(siblings, "timer") | _outputs(siblings, "loop")
+        return of_siblings | _outputs(named_loops, "loop")
     if MESSAGE_FILTER in (callback.symbol or "") or not published_itself - INTERNAL_TOPICS:
         of_other_topics = [sibling for sibling in siblings if sibling.topic != callback.topic]
         return (
@@ -111,7 +146,9 @@ def _in_turns(flow: DataFlow, nodes: Iterable[list[Callback]]) -> dict[int, set[
     topics_of = defaultdict[int, set[str]](set)
     for callbacks in nodes:
         for topic in _outputs(callbacks, "subscription"):
-            writers = [c for c in callbacks if topic in c.publishes and c.kind != "unknown"]
+            writers = [
+                c for c in callbacks if topic in c.publishes and c.kind not in ("loop", "unknown")
+            ]
             inputs = {writer.topic for writer in writers if writer.kind == "subscription"}
             if len(writers) < 2 or len(inputs) < len(writers):
                 continue  # a single writer, or a timer among them, or two inputs of one topic

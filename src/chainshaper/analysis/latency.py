@@ -19,6 +19,7 @@ from chainshaper.analysis.disturbance import (
 )
 from chainshaper.analysis.flow import DataFlow, data_flow, recorded_flow, timer_calls
 from chainshaper.analysis.graph import graph_of
+from chainshaper.analysis.loops import loop_figures
 from chainshaper.analysis.outputs_due import not_begun, with_outputs_due
 from chainshaper.analysis.traversals import reception, traverse
 from chainshaper.values import events
@@ -101,7 +102,7 @@ def callback_statistics(flow: DataFlow) -> pl.DataFrame:
     """Make a frame of every callback that was seen to run, one row each. Columns:
 
     * ``callback_id, node, kind, topic, symbol``.
-    * ``period_ns``: the period of a timer's starts.
+    * ``period_ns``: the period of a timer's, or a loop's, starts.
     * ``declared_ns``: the period with which the timer was created.
     * ``pid``: its process, the last one of a node that was started again; ``pids``: all of them.
     * ``tids``: the threads that ran it.
@@ -109,10 +110,14 @@ def callback_statistics(flow: DataFlow) -> pl.DataFrame:
     * ``unfinished``: how many of these have no end.
     * ``response_ns``, ``execution_ns``: structs ``{min, mean, max}`` in ns (means are floats); null
       where no instance has such a time.
+    * ``phase_ns``, ``start_jitter_ns``, ``overruns``: of loops
+      (:func:`~chainshaper.analysis.loops.loop_figures`); null for all others.
     """
     # Of a callback's registrations those of its node's last process come first.
     about = flow.objects.callbacks.unique("callback_id", keep="first", maintain_order=True)
-    ran = flow.instances.filter(~pl.col("assumed")).group_by("callback_id")
+    loops = about.filter(pl.col("kind") == "loop")["callback_id"]
+    is_seen = ~pl.col("assumed") | pl.col("callback_id").is_in(loops.implode())
+    ran = flow.instances.filter(is_seen).group_by("callback_id")
     figures = ran.agg(
         pids=pl.col("pid").unique(maintain_order=True),
         tids=pl.col("tid").unique().sort(),
@@ -123,6 +128,8 @@ def callback_statistics(flow: DataFlow) -> pl.DataFrame:
     )
     names = ("callback_id", "node", "kind", "topic", "period_ns", "declared_ns", "symbol", "pid")
     joined = about.select(names).join(figures, on="callback_id")
+    of_loops = loop_figures(about, flow.instances, flow.turns)
+    joined = joined.join(of_loops, on="callback_id", how="left")
     return joined.sort("callback_id")
 
 
@@ -195,7 +202,8 @@ def executors(flow: DataFlow) -> list[RecordedExecutor]:
     columns_of_runs = ("callback_id", "pid", "tid")
     calls = timer_calls(flow.events, flow.objects).select(columns_of_runs)
     ran = pl.concat([flow.instances.select(columns_of_runs), calls]).unique()
-    known = flow.objects.callbacks.filter((pl.col("kind") != "unknown") | pl.col("observed"))
+    without_executor = pl.col("kind").is_in(["loop", "unknown"]) & ~pl.col("observed")
+    known = flow.objects.callbacks.filter(~without_executor)
     # Of a node that was started again only the threads of its last process count.
     known = known.unique("callback_id", keep="first", maintain_order=True).join(
         ran.group_by("callback_id", "pid").agg(tids=pl.col("tid").sort()),

@@ -13,7 +13,7 @@ import polars as pl
 
 from chainshaper.analysis.matching import first_after, latest_before, nearest
 from chainshaper.values import events
-from chainshaper.values.application import INTERNAL_SERVICES, REQUEST, RESPONSE
+from chainshaper.values.application import INTERNAL_SERVICES, LOOP_END, REQUEST, RESPONSE
 
 _CALL = ("request", "response")
 _NEARLY_ALWAYS = 0.9  # of a callback's starts: so many must come behind a take of its subscription
@@ -53,7 +53,7 @@ class Objects:
         * ``pid``, ``handle``: process and address.
         * ``valid_from``, ``valid_to``: from its registration until another one of the same address
           (null: there was none).
-        * ``kind``: ``timer``, ``subscription``, ``service``, ``client`` or ``unknown``.
+        * ``kind``: ``timer``, ``subscription``, ``service``, ``client``, ``loop`` or ``unknown``.
         * ``node``.
         * ``topic``: the topic's or the service's name.
         * ``declared_ns``: the period with which a timer was created.
@@ -61,7 +61,7 @@ class Objects:
           that its starts show.
         * ``symbol``: the name of its function.
         * ``observed``: false for what has no callback events: subscriptions, services and timers of
-          rclpy, services of actions, and all clients.
+          rclpy, services of actions, loops, and all clients.
         * ``subscription``: its number in that frame.
     ``buffers``
         Ring buffers for messages within a process: ``pid, buffer, valid_from, callback_id``.
@@ -134,6 +134,21 @@ def named_nodes(tables: events.EventTables) -> pl.DataFrame:
     return created.select("pid", handle="node_handle", valid_from="time", node=events.NODE_NAME)
 
 
+def named_loops(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
+    """Make a frame of the loops that the user named: ``pid, tid, valid_from, node, is_thread``.
+
+    A thread that was named by its own name counts as one of the node that its process created
+    first.
+    """
+    named = events.table(tables, "loop_named")
+    first = nodes.unique("pid", keep="first", maintain_order=True).select("pid", first="node")
+    joined = named.join(first, on="pid", how="left", maintain_order="left")
+    is_thread = pl.col("is_thread") != 0
+    node = pl.when(is_thread).then("first").otherwise("name")
+    chosen = joined.select("pid", "tid", valid_from="time", node=node, is_thread=is_thread)
+    return chosen.drop_nulls("node")
+
+
 def _with_node(objects: pl.DataFrame, nodes: pl.DataFrame, at: str) -> pl.DataFrame:
     """Add ``node``: the name of the node that had the row's ``node_handle`` at the instant ``at``.
 
@@ -168,7 +183,8 @@ def endpoints(tables: events.EventTables) -> pl.DataFrame:
 def _carrying(tables: events.EventTables, ends: pl.DataFrame, kind: str) -> pl.DataFrame:
     """Make the frame ``publishers`` or ``subscriptions`` (``kind``) of :class:`Objects`.
 
-    Clients and servers whose calls were seen count as both.
+    Clients and servers whose calls were seen count as both. A loop that the user named publishes
+    the ends of its instances.
     """
     parts = [ends.filter(role=kind)]
     internal = pl.col("topic").str.extract("([^/]*)$").is_in(INTERNAL_SERVICES)
@@ -181,6 +197,11 @@ def _carrying(tables: events.EventTables, ends: pl.DataFrame, kind: str) -> pl.D
         used = used.join(seen.unique(), on=["pid", "rmw_handle"], how="semi", maintain_order="left")
         suffix = f":{sends if kind == 'publisher' else takes}"
         parts.append(used.with_columns(pl.col("topic") + suffix))
+    if kind == "publisher":
+        loops = named_loops(tables, named_nodes(tables)).select("pid", "node", "valid_from")
+        loops = loops.unique(["pid", "node"], keep="first", maintain_order=True)
+        loops = loops.with_columns(topic=pl.col("node") + LOOP_END)
+        parts = [pl.concat([*parts, loops], how="diagonal_relaxed")]
     return pl.concat(parts).drop("role").with_row_index(kind)
 
 

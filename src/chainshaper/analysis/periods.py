@@ -18,8 +18,8 @@ import polars as pl
 FEWEST = 8
 """How many distances between starts are needed for a verdict."""
 _SAME = 0.02  # share of a period by which another one may differ and still be the same
-_REGULAR = 0.1  # share of the usual distance of starts by which regular ones may differ from it
-_MOSTLY = 0.8  # the share of starts that must be regular, or come after waiting
+REGULAR = 0.1  # share of the usual distance of starts by which regular ones may differ from it
+MOSTLY = 0.8  # the share of starts that must be regular, or come after waiting
 _IDLE = 0.1  # share of the period for which a thread that waited had nothing to do
 _CLOCKS = 1e-4  # how far the clock of timers and that of events may run apart
 
@@ -54,12 +54,12 @@ def shown_periods(
         usual = float(np.median(apart))
         often = _too_often(starts, declared)
         rare = usual > declared * (1 + _SAME) and not often
-        regular = float(np.mean(np.abs(apart - usual) <= _REGULAR * usual)) >= _MOSTLY
+        regular = float(np.mean(np.abs(apart - usual) <= REGULAR * usual)) >= MOSTLY
         if not often and not (
             rare and regular and _waited_in_vain(callbacks, instances, number, declared, usual)
         ):
             continue
-        period = _period(apart, usual) if regular else None
+        period = roundest_period(apart, usual) if regular else None
         yield ShownPeriod(
             callback_id=number,
             node=node,
@@ -113,10 +113,10 @@ def _waited_in_vain(
     due = pl.col("start").shift(1) + declared
     free = pl.max_horizontal(due, "over_tid", "over_node")
     waited = (pl.col("start") - free > _IDLE * usual).filter(due.is_not_null())
-    return float(of_timer.select(waited.mean()).item() or 0.0) >= _MOSTLY
+    return float(of_timer.select(waited.mean()).item() or 0.0) >= MOSTLY
 
 
-def _period(apart: npt.NDArray[np.int64], usual: float) -> int:
+def roundest_period(apart: npt.NDArray[np.int64], usual: float) -> int:
     """Return the roundest period (ns) that agrees with the distances of regular starts."""
     cycles = int(np.maximum(1, np.round(apart / usual)).sum())
     mean = float(apart.sum() / cycles)

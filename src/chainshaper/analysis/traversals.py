@@ -20,8 +20,14 @@ reason "not used"; no output is missing for them. message_filters has queues ins
 message counts, also where several came before one publication although only one can have been in
 it; ``notes`` says so.
 
+**A message's first use is the reaction.** A timer, or a loop, that is faster than its input uses a
+message again. These repeats are no traversals: they are older data
+(:mod:`~chainshaper.analysis.data_age`). A loop that takes messages itself, in the turn in which it
+publishes, uses them at once.
+
 **One row per data flow.** An instance that publishes a topic twice makes two traversals, with
-the same start.
+the same start. In Python no event shows where a callback ends, so of what is published behind a
+take only the first counts.
 
 **A standby.** While a shaping node is not there, its standby publishes the chain's output: the
 traversal goes on with the standby's instance.
@@ -38,7 +44,7 @@ import numpy as np
 import polars as pl
 
 from chainshaper.analysis.flow import DataFlow
-from chainshaper.analysis.graph import MESSAGE_FILTER, goes_on_elsewhere, graph_of
+from chainshaper.analysis.graph import MESSAGE_FILTER, goes_on_elsewhere, graph_of, readers
 from chainshaper.analysis.matching import by_number, first_after, in_order, latest_before
 from chainshaper.analysis.messages import (
     discarded_instances,
@@ -57,7 +63,7 @@ REASONS: dict[str, str] = {
     "event says: there are none of its takes",
     "not executed": "taken, but no callback instance got it",
     "not published": "its callback instance, or its process, ended without publishing",
-    "not used": "stored for a timer or a synchroniser of its node, which used a newer message",
+    "not used": "stored for a timer, a loop or a synchroniser, which used a newer message",
     "inactive": "its node is a lifecycle node, which was not active then",
     "discarded": "withheld on purpose: it had overrun its slot or outlived its lifespan, or newer "
     "messages had filled its asynchronous publisher's history",
@@ -138,7 +144,8 @@ def traverse(flow: DataFlow, chain: Chain, graph: ApplicationGraph | None = None
             state = _take(flow, state, hop, callback, standby=standby, topic=topic)
         state = _publish(flow, state, hop, [callback.id, *standby], topic)
         if topic in callback.passes_on or (hop and goes_on_elsewhere(graph, callback, topic)):
-            state, note = _publish_by_sibling(flow, state, hop, callback, topic)
+            reading = readers(graph, callback, topic)
+            state, note = _publish_by_sibling(flow, state, hop, callback, topic, reading)
             if _keeps_newest(graph, callback, topic):
                 state = _newest_alone(state, hop)
             notes += note
@@ -192,6 +199,9 @@ def _publish(
     for_hop = pl.col("callback_id").is_in(callbacks) & (pl.col("topic") == topic)
     published = flow.publications.lazy().filter(for_hop & pl.col("instance").is_not_null())
     inside = published.select("instance", "publication").collect()
+    endless = pl.lit(flow.instances["assumed"] & flow.instances["end"].is_null())
+    again = pl.col("instance").is_duplicated() & ~pl.col("instance").is_first_distinct()
+    inside = inside.filter(~(endless.gather("instance") & again))
     instance, publication = f"instance_{hop}", f"publication_{hop}"
     first = by_number(inside, "instance", "publication", flow.instances.height)
     if first.count() == inside.height:
@@ -203,31 +213,44 @@ def _publish(
 
 
 def _publish_by_sibling(
-    flow: DataFlow, state: pl.DataFrame, hop: int, callback: Callback, topic: str
+    flow: DataFlow,
+    state: pl.DataFrame,
+    hop: int,
+    callback: Callback,
+    topic: str,
+    reading: Sequence[Callback],
 ) -> tuple[pl.DataFrame, list[str]]:
     """Fill in what another callback of the node published for the message.
 
-    It is the publication of the node's first instance that starts after the message's own. Messages
-    from before the node was started again have none: the new process never got them. The notes say
-    where it is not clear which input an output of message_filters got.
+    It is the publication of the node's first instance that starts after the message's own; or of
+    the instance of a loop in which it was taken. Messages from before the node was started again
+    have none: the new process never got them. ``reading`` are timers and loops that publish what
+    the callback stored, also those of other nodes. The notes say where it is not clear which input
+    an output of message_filters got.
     """
     publication, sibling = f"publication_{hop}", f"sibling_{hop}"
     publishers = flow.objects.publishers.select("publisher", created="valid_from")
-    of_node = pl.col("pid").is_in(callback.processes) & (pl.col("node") == callback.node)
-    candidates = flow.publications.filter((pl.col("topic") == topic) & of_node)
+    of_node = pl.col("node").is_in([callback.node, *(reader.node for reader in reading)])
+    of_process = pl.col("pid").is_in(callback.processes)
+    candidates = flow.publications.filter((pl.col("topic") == topic) & of_process & of_node)
     began = pl.coalesce(_looked_up(flow.instances, "start", "instance"), "time")
     candidates = candidates.select(
-        "publisher", "callback_id", "time", later="publication", began=began
+        *("publisher", "callback_id", "instance", "tid", "time"), later="publication", began=began
     )
     candidates = candidates.join(publishers, on="publisher", how="left", maintain_order="left")
     waiting = pl.col(publication).is_null() & pl.col(f"instance_{hop}").is_not_null()
     start = _looked_up(flow.instances, "start", f"instance_{hop}")
-    rows = state.with_row_index("row").filter(waiting).select("row", start=start)
+    rows = state.with_row_index("row").filter(waiting)
+    rows = rows.select("row", start=start, instance_of_row=f"instance_{hop}")
     if topic in callback.in_turns:
         candidates = _begun_with_last_input(
             candidates.sort("began"), rows["start"].sort(), callback.id
         )
     matches = first_after(rows, candidates, [], "start", "began", strictly=True)
+    loops = [reader.id for reader in reading if reader.kind == "loop"]
+    if loops:
+        matches = pl.concat([matches, _used_in_turn(flow, rows, candidates, loops)])
+        matches = matches.sort("later", descending=True, nulls_last=False)  # the first use counts
     matches = matches.filter(pl.col("created") <= pl.col("start"))
     later = by_number(matches, "row", "later", state.height)
     state = state.with_columns(
@@ -253,16 +276,29 @@ def _publish_by_sibling(
     return state, [note] if shared else []
 
 
+def _used_in_turn(
+    flow: DataFlow, rows: pl.DataFrame, candidates: pl.DataFrame, loops: Sequence[int]
+) -> pl.DataFrame:
+    """Match messages that a loop took itself to what it published later in the same turn.
+
+    The result has the columns of `first_after` of the two frames.
+    """
+    own = candidates.filter(pl.col("callback_id").is_in(loops))
+    own = own.with_columns(turn_began="began", began="time")  # later than the message, in this turn
+    tid = _looked_up(flow.instances, "tid", "instance_of_row")
+    by_thread = rows.with_columns(tid=tid)
+    matches = first_after(by_thread, own, ["tid"], "start", "began", strictly=True)
+    return matches.filter(pl.col("turn_began") <= pl.col("start")).select(
+        *rows.columns, *(pl.col(name) for name in candidates.columns)
+    )
+
+
 def _keeps_newest(graph: ApplicationGraph, callback: Callback, topic: str) -> bool:
     """Return whether the node stores only the newest of the messages that the callback reads."""
     if callback.kind == "service":
         return False  # each goal of an action has feedback of its own
-    by_timer = any(
-        sibling.kind == "timer" and topic in sibling.publishes
-        for sibling in graph.callbacks
-        if (sibling.node, sibling.pid) == (callback.node, callback.pid)
-    )
-    return by_timer or MESSAGE_FILTER not in (callback.symbol or MESSAGE_FILTER)
+    is_read = bool(readers(graph, callback, topic))
+    return is_read or MESSAGE_FILTER not in (callback.symbol or MESSAGE_FILTER)
 
 
 def _newest_alone(state: pl.DataFrame, hop: int) -> pl.DataFrame:

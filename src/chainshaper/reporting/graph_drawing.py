@@ -70,6 +70,7 @@ COLOURS = {
     "subscription": "#1f6fb2",
     "service": "#6b4fa0",
     "client": "#3b7d4f",
+    "loop": "#8a6d00",
     "unknown": "#777777",
 }
 # A report has several pictures beside other drawings: each rule is for these pictures alone.
@@ -169,6 +170,8 @@ def callback_text(callback: Callback) -> str:
     """Text: what triggers a callback."""
     if callback.kind == "timer":
         return f"timer {period_text(callback.period_ns or 0, callback.declared_ns)}"
+    if callback.kind == "loop":
+        return f"loop {period_text(callback.period_ns, None) if callback.period_ns else ''}".rstrip()
     if callback.kind == "unknown":
         return "not known" if callback.handle else "outside callbacks"
     return f"{callback.kind} {callback.topic or ''}".rstrip()

@@ -60,6 +60,11 @@ COLOURS = {"good": "green", "limited": "yellow", "absent": "red"}
 MARKS = {"good": "✓", "limited": "!", "absent": "✗"}
 BACK_END = "back end "  # what the name of a back end's check begins with
 WORTH_SAYING_NS = 1_000_000  # of a stall: as long as the shortest slot
+OF_LOOPS = {  # column of `callback_statistics` that loops alone have → title
+    "phase_ns": "phase",
+    "start_jitter_ns": "jitter\nof start",
+    "overruns": "overruns",
+}
 MOST_ROWS = 50  # points of a sweep that a table shows
 MOST_SLOTS = 8  # slots of a server that a table shows
 SWEEP_FIGURES = {  # column of a sweep's frame → title
@@ -128,13 +133,14 @@ def callback_rows(statistics: pl.DataFrame) -> list[dict[str, Any]]:
     See :func:`~chainshaper.analysis.latency.callback_statistics`.
     """
     columns = ("node", "kind", "topic", "period_ns", "declared_ns", "pid", "pids", "tids", "count")
-    return statistics.select(*columns, "response_ns", "execution_ns").to_dicts()
+    times = ("response_ns", "execution_ns", *OF_LOOPS)
+    return statistics.select(*columns, *times).to_dicts()
 
 
 def callback_table(statistics: pl.DataFrame) -> ResultTable:
     """Make a table of callbacks: threads, number of instances, execution and response times.
 
-    Execution and response times have columns only where there are any. The name of the function has
+    Execution and response times, and figures of loops, have columns only where there are any. The name of the function has
     a column in the report. On the terminal it stands behind callbacks that look alike without it.
     """
     measured = [name for name in ("execution", "response") if statistics[f"{name}_ns"].count()]
@@ -142,6 +148,8 @@ def callback_table(statistics: pl.DataFrame) -> ResultTable:
     columns += figures("thread", "count")
     for name in measured:
         columns += figures(*(f"{name}\n{figure}" for figure in ("min", "mean", "max")))
+    of_loops = [name for name in OF_LOOPS if statistics[name].count()]
+    columns += figures(*(OF_LOOPS[name] for name in of_loops))
     table = ResultTable("Callbacks [ms]", columns)
     rows = []
     for row in statistics.to_dicts():
@@ -153,7 +161,11 @@ def callback_table(statistics: pl.DataFrame) -> ResultTable:
         symbol, trigger = short_symbol(row["symbol"]), key[2]
         shown = f"{trigger} ({symbol})" if symbol and alike[key] > 1 else trigger
         times = (cell for name in measured for cell in min_mean_max(row[f"{name}_ns"]))
-        table.add(row["node"] or "", shown, symbol, listed(row["tids"]), row["count"], *times)
+        loop = (
+            ms(row[name]) if name != "overruns" or row[name] is None else row[name]
+            for name in of_loops
+        )
+        table.add(row["node"] or "", shown, symbol, listed(row["tids"]), row["count"], *times, *loop)
     return table
 
 

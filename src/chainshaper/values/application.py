@@ -20,11 +20,16 @@ INTERNAL_SERVICES = frozenset((*_PARAMETERS, *_STATES)) | {
 
 REQUEST, RESPONSE = ":request", ":response"
 """Endings of a service's name: requests and responses are treated as messages on such topics."""
-CallbackKind: TypeAlias = Literal["timer", "subscription", "service", "client", "unknown"]
+LOOP_END = ":end"
+"""Ending of a node's name: the end of each instance of its named loop counts as a message there."""
+CallbackKind: TypeAlias = Literal["timer", "subscription", "service", "client", "loop", "unknown"]
 """What starts a callback.
 
+"loop": a thread of the node's own, which sleeps in between (``handle`` is 0).
+
 "unknown": its creation was not seen, since tracing started later; or only its publications were
-seen, since a thread of the node's own makes them (``handle`` is 0 then).
+seen, since a thread of the node's own makes them, of whose sleep no event tells (``handle`` is 0
+then).
 """
 
 
@@ -74,7 +79,7 @@ class Callback:
     pid: int
     handle: int  # its address in the traced process; other processes may have the same
     topic: str | None = None  # subscribed topic, or the service's name
-    period_ns: int | None = None  # of a timer, as its starts show it
+    period_ns: int | None = None  # of a timer or a loop, as its starts show it
     symbol: str | None = None  # the registered function, demangled where possible
     publishes: tuple[str, ...] = ()  # topics on which it publishes, or another one for it
     passes_on: tuple[str, ...] = ()  # those of `publishes` that another callback writes for it
@@ -98,6 +103,8 @@ class Callback:
         """A short text that tells callbacks apart: ``/node2 ← /t1`` or ``/node1 every 100ms``."""
         if self.kind == "timer":
             return f"{self.node} {trigger_text(None, self.period_ns or 0, self.declared_ns)}"
+        if self.kind == "loop":
+            return f"{self.node} loop {trigger_text(None, self.period_ns)}".rstrip()
         if self.kind == "unknown" and not self.handle:
             return f"{self.node} outside callbacks"
         if self.kind == "unknown":

@@ -126,7 +126,7 @@ def described_chain(evidence: Evidence, nodes: Mapping[str, DescribedNode]) -> s
 
 def _describable(callback: Callback) -> bool:
     """Return whether a description can have a callback: a timer, a subscription, or a driver."""
-    if callback.kind == "unknown":
+    if callback.kind in ("loop", "unknown"):
         return bool(own_topics(callback))
     return callback.kind in ("timer", "subscription") and callback.topic not in INTERNAL_TOPICS
 

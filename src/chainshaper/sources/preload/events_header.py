@@ -9,7 +9,12 @@ import zlib
 from collections.abc import Iterable
 from pathlib import Path
 
-from chainshaper.values.event_declarations import Event, FieldKind, events_of_library
+from chainshaper.values.event_declarations import (
+    SLEEPING_CALLS,
+    Event,
+    FieldKind,
+    events_of_library,
+)
 
 _LAYOUT = 3
 """To be increased when the memory of a traced process changes otherwise than by its events."""
@@ -21,6 +26,9 @@ _TEMPLATE = """\
 // CALL: name of the function in rmw.
 #define ALL_EVENTS(EVENT, CREATION, CALL) \\
   {lines}
+// The functions by which a thread sleeps, as `thread_sleep` and `thread_wake` number them.
+#define SLEEPING_CALLS(CALL) \\
+  {calls}
 """
 
 
@@ -48,7 +56,8 @@ def _places(event: Event, kind: FieldKind | None = None) -> list[int]:
 
 def events_header(events: Iterable[Event]) -> str:
     """Return the text of `events.h`, without the number of its format."""
-    return _TEMPLATE.format(lines=" \\\n  ".join(map(event_line, events)))
+    calls = " ".join(f"CALL({name})" for name in SLEEPING_CALLS)
+    return _TEMPLATE.format(lines=" \\\n  ".join(map(event_line, events)), calls=calls)
 
 
 def format_of(header: str) -> int:

@@ -28,6 +28,11 @@
 //   is closed only while it is still that of our file, since a node may close all descriptors and
 //   use their numbers again.
 //
+// A loop that is no callback (a control loop in a thread of its own) is seen by how its thread sleeps:
+// we stand in front of the functions by which threads sleep for a time (`SLEEPS`). Sleeps are recorded
+// of threads that publish outside callbacks, and of loops that the user named in CHAINSHAPER_LOOPS.
+// All others pass by two comparisons.
+//
 // Times are ns of CLOCK_MONOTONIC. Values are a function's arguments as they are in registers (of a
 // bool only the lowest byte counts). Calls of services have trace points from Kilted on only; so we
 // record them where librcl calls rmw.
@@ -36,9 +41,12 @@
 // integers or pointers, at most five, so functions of all versions can be called in the same way.
 // rmw, `rmw/types.h` and `rmw/rmw.h`, Humble to Rolling: `rmw_service_info_t`, `rmw_request_id_t`.
 #define _GNU_SOURCE
+#undef _FORTIFY_SOURCE  // with it headers define some of the functions that we stand in front of
 #include <dlfcn.h>
 #include <errno.h>
 #include <fcntl.h>
+#include <link.h>
+#include <poll.h>
 #include <pthread.h>
 #include <sched.h>
 #include <signal.h>
@@ -48,11 +56,14 @@
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/epoll.h>
 #include <sys/mman.h>
 #include <sys/prctl.h>
+#include <sys/select.h>
 #include <sys/socket.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
+#include <sys/timerfd.h>
 #include <sys/un.h>
 #include <time.h>
 #include <unistd.h>
@@ -120,6 +131,10 @@ static __thread struct {
   uint64_t used_at;        // when it was read
   uint64_t last_used;      // CPU time in the latest record
   bool calls_timer;        // it is in rcl_timer_call
+  bool publishes;          // it has published outside callbacks
+  bool is_named;           // the user named it as a loop
+  bool sleeps;             // it is in a function that we stand in front of, of which the sleep is recorded
+  int callbacks;           // that run in it, one within the other
   uint16_t latest;         // event
 } thread;
 
@@ -453,6 +468,71 @@ static void create(uint16_t event, unsigned texts, unsigned gid, uint64_t *value
 #define NUMBER(name, ...) number_##name,
 enum { before_first = FIRST_EVENT - 1, ALL_EVENTS(NUMBER, NUMBER, NUMBER) };
 
+// The names of loops that the user gave, of nodes (with a slash) and threads, each with a comma behind.
+#define LOOPS "CHAINSHAPER_LOOPS"
+#define THREAD_NAME 16u  // of the kernel, with the 0 at its end
+static char loops[4096];
+static bool names_threads;
+static _Atomic bool has_named_node;  // a node whose loop is named was created in this process
+
+__attribute__((constructor)) static void read_loops(void) {
+  const char *given = getenv(LOOPS);
+  size_t length = given ? strnlen(given, sizeof loops) : 0;
+  if (!length || length + 2 > sizeof loops) return;
+  memcpy(loops, given, length);
+  loops[length] = ',';
+  for (size_t at = 0; at < length; at++)
+    names_threads = names_threads || (loops[at] != '/' && (at == 0 || loops[at - 1] == ','));
+}
+
+static bool is_named(const char *name, size_t length) {
+  for (const char *at = loops; *at; at = strchr(at, ',') + 1)
+    if (length && strncmp(at, name, length) == 0 && at[length] == ',') return true;
+  return false;
+}
+
+static void created_node(const char *name, const char *space) {
+  char full[512];
+  if (!*loops || !name || !space) return;
+  size_t before = strnlen(space, sizeof full), length = strnlen(name, sizeof full);
+  if (before && space[before - 1] == '/') before--;
+  if (before + length + 2 > sizeof full) return;
+  memcpy(full, space, before);
+  full[before] = '/';
+  memcpy(&full[before + 1], name, length);
+  full[before + 1 + length] = 0;
+  if (!is_named(full, before + 1 + length)) return;
+  has_named_node = true;
+  create(number_loop_named, 1, 0, (uint64_t[6]){(uintptr_t)full, 0});
+}
+
+// Publishers of topics that every node has for itself, by their handles: a thread that only writes to
+// the log is no loop. Of two with one place the later one counts.
+static _Atomic uint64_t internal_publishers[1024];
+#define PLACE(handle) (&internal_publishers[((handle) >> 4) % 1024])
+
+static void created_publisher(uint64_t handle, const char *topic) {
+  bool internal = topic && (!strcmp(topic, "/rosout") || !strcmp(topic, "/parameter_events"));
+  if (internal || *PLACE(handle) == handle) *PLACE(handle) = internal ? handle : 0;
+}
+
+static void note_creation(unsigned event, const uint64_t *values) {
+  if (event == number_rcl_node_init)
+    created_node((const char *)(uintptr_t)values[2], (const char *)(uintptr_t)values[3]);
+  if (event == number_rcl_publisher_init)
+    created_publisher(values[0], (const char *)(uintptr_t)values[3]);
+}
+
+// From its first publication outside callbacks on a thread's sleeps are recorded.
+static inline void note(unsigned event, uint64_t handle) {
+  if (event == number_callback_start) thread.callbacks++;
+  if (event == number_callback_end && thread.callbacks) thread.callbacks--;
+  bool publishes = event == number_rcl_publish || event == number_rclcpp_intra_publish;
+  if (!publishes || thread.publishes || thread.callbacks || *PLACE(handle) == handle) return;
+  thread.publishes = true;
+  write_record(number_thread_wake, 0, 1, (uint64_t[6]){0}, true);
+}
+
 #define ARGUMENTS uint64_t a, uint64_t b, uint64_t c, uint64_t d, uint64_t e
 typedef void (*function)(ARGUMENTS);
 typedef bool (*question)(void);
@@ -481,10 +561,11 @@ typedef bool (*question)(void);
   bool ros_trace_enabled_##name(void) { return true; }
 
 #define EVENT_HOOK(name, count, timed) \
-  HOOK(name, thread.latest = number_##name; \
+  HOOK(name, thread.latest = number_##name; note(number_##name, a); \
        write_record(number_##name, 0, count, ((uint64_t[6]){a, b, c, d, e}), timed))
 #define CREATION_HOOK(name, texts, gid) \
-  HOOK(name, create(number_##name, texts, gid, (uint64_t[6]){a, b, c, d, e}))
+  HOOK(name, create(number_##name, texts, gid, (uint64_t[6]){a, b, c, d, e}); \
+       note_creation(number_##name, (uint64_t[6]){a, b, c, d, e}))
 #define NO_HOOK(name)
 ALL_EVENTS(EVENT_HOOK, CREATION_HOOK, NO_HOOK)
 
@@ -563,3 +644,204 @@ int rmw_take_with_info(const void *subscription, void *message, bool *taken, int
   }
 TIMER_CALL(rcl_timer_call)
 TIMER_CALL(rcl_timer_call_with_info)
+
+// How threads sleep. `until` is 0 where the call does not say it.
+#define CALL_NUMBER(name) sleeps_by_##name,
+enum { SLEEPING_CALLS(CALL_NUMBER) };
+#define NO_SLEEP UINT64_MAX
+
+static uint64_t nanoseconds(const struct timespec *time) {
+  return (uint64_t)time->tv_sec * 1000000000u + (uint64_t)time->tv_nsec;
+}
+
+static uint64_t in(uint64_t duration) {
+  return duration ? now(CLOCK_MONOTONIC) + duration : NO_SLEEP;
+}
+
+static uint64_t in_milliseconds(int duration) {
+  return duration < 0 ? 0 : in((uint64_t)duration * 1000000u);
+}
+
+static uint64_t in_time(const struct timespec *duration) {
+  return duration ? in(nanoseconds(duration)) : 0;
+}
+
+static uint64_t at(clockid_t clock, const struct timespec *time) {
+  if (clock == CLOCK_MONOTONIC) return nanoseconds(time);
+  return now(CLOCK_MONOTONIC) + (nanoseconds(time) - now(clock));
+}
+
+// A condition variable does not say by which clock it waits. The wall clock shows decades, the other
+// one the time since the machine started.
+static uint64_t at_either(const struct timespec *time) {
+  bool of_wall_clock = nanoseconds(time) > now(CLOCK_REALTIME) / 2;
+  return at(of_wall_clock ? CLOCK_REALTIME : CLOCK_MONOTONIC, time);
+}
+
+// Whether the sleeps of this thread are recorded. Of the other threads of a process whose node is
+// named, only those count that can do nothing but sleep: executors wait as well.
+static bool is_followed(int call) {
+  if (!memory || !*memory_is_ours || thread.callbacks || thread.sleeps) return false;
+  if (thread.publishes || thread.is_named) return true;
+  if (names_threads) {
+    char name[THREAD_NAME] = "";
+    prctl(PR_GET_NAME, name);
+    thread.is_named = is_named(name, strnlen(name, THREAD_NAME));
+    if (thread.is_named) create(number_loop_named, 1, 0, (uint64_t[6]){(uintptr_t)name, 1});
+  }
+  bool for_a_time =
+    call == sleeps_by_clock_nanosleep || call == sleeps_by_nanosleep || call == sleeps_by_timerfd;
+  return thread.is_named || (has_named_node && for_a_time);
+}
+
+static bool begin_sleep(int call, uint64_t until) {
+  if (until == NO_SLEEP) return false;
+  int before = errno;
+  write_record(number_thread_sleep, 0, 2, (uint64_t[6]){until, (uint64_t)call}, true);
+  errno = before;
+  return thread.sleeps = true;
+}
+
+static void end_sleep(int call) {
+  int before = errno;
+  thread.sleeps = false;
+  write_record(number_thread_wake, 0, 1, (uint64_t[6]){(uint64_t)call}, true);
+  errno = before;
+}
+
+// The function of the C library behind ours. Of condition variables dlsym may find an old version.
+static void *function_of_libc(const char *name) {
+  void *address = dlvsym(RTLD_NEXT, name, "GLIBC_2.3.2");
+  return address ? address : dlsym(RTLD_NEXT, name);
+}
+
+#define LIBC(type, name, parameters) \
+  static type(*_Atomic behind) parameters; \
+  if (!behind) behind = (type(*) parameters)function_of_libc(#name)
+
+#define SLEEPS(type, name, parameters, arguments, call, until) \
+  type name parameters { \
+    LIBC(type, name, parameters); \
+    bool recorded = is_followed(sleeps_by_##call) && begin_sleep(sleeps_by_##call, until); \
+    type result = behind arguments; \
+    if (recorded) end_sleep(sleeps_by_##call); \
+    return result; \
+  }
+typedef const struct timespec *time_of;
+SLEEPS(int, clock_nanosleep, (clockid_t clock, int flags, time_of time, struct timespec *rest),
+       (clock, flags, time, rest), clock_nanosleep,
+       flags & TIMER_ABSTIME ? at(clock, time) : in_time(time))
+SLEEPS(int, nanosleep, (time_of time, struct timespec *rest), (time, rest), nanosleep, in_time(time))
+SLEEPS(int, usleep, (useconds_t time), (time), nanosleep, in((uint64_t)time * 1000u))
+SLEEPS(unsigned, sleep, (unsigned time), (time), nanosleep, in((uint64_t)time * 1000000000u))
+SLEEPS(int, pthread_cond_clockwait,
+       (pthread_cond_t *condition, pthread_mutex_t *mutex, clockid_t clock, time_of time),
+       (condition, mutex, clock, time), pthread_cond_clockwait, at(clock, time))
+SLEEPS(int, poll, (struct pollfd *files, nfds_t count, int time), (files, count, time), poll,
+       in_milliseconds(time))
+SLEEPS(int, ppoll, (struct pollfd *files, nfds_t count, time_of time, const sigset_t *signals),
+       (files, count, time, signals), poll, in_time(time))
+SLEEPS(int, epoll_wait, (int file, struct epoll_event *events, int count, int time),
+       (file, events, count, time), epoll_wait, in_milliseconds(time))
+SLEEPS(int, epoll_pwait,
+       (int file, struct epoll_event *events, int count, int time, const sigset_t *signals),
+       (file, events, count, time, signals), epoll_wait, in_milliseconds(time))
+SLEEPS(int, epoll_pwait2,
+       (int file, struct epoll_event *events, int count, time_of time, const sigset_t *signals),
+       (file, events, count, time, signals), epoll_wait, in_time(time))
+SLEEPS(int, select, (int count, fd_set *in_, fd_set *out, fd_set *errors, struct timeval *time),
+       (count, in_, out, errors, time), select,
+       time ? in((uint64_t)time->tv_sec * 1000000000u + (uint64_t)time->tv_usec * 1000u) : 0)
+SLEEPS(int, pselect,
+       (int count, fd_set *in_, fd_set *out, fd_set *errors, time_of time, const sigset_t *signals),
+       (count, in_, out, errors, time, signals), select, in_time(time))
+
+// Where the interpreter of Python lies in memory: its threads wait by a condition variable for the
+// interpreter's lock, which is no sleep of theirs.
+static struct {
+  _Atomic bool known;
+  uintptr_t begin, end;
+} interpreter;
+
+static int look_for_interpreter(struct dl_phdr_info *object, size_t size, void *function) {
+  uintptr_t begin = UINTPTR_MAX, end = 0;
+  (void)size;
+  for (unsigned part = 0; part < object->dlpi_phnum; part++) {
+    if (object->dlpi_phdr[part].p_type != PT_LOAD) continue;
+    uintptr_t from = object->dlpi_addr + object->dlpi_phdr[part].p_vaddr;
+    if (from < begin) begin = from;
+    if (from + object->dlpi_phdr[part].p_memsz > end) end = from + object->dlpi_phdr[part].p_memsz;
+  }
+  if ((uintptr_t)function < begin || (uintptr_t)function >= end) return 0;
+  interpreter.begin = begin;
+  interpreter.end = end;
+  return 1;
+}
+
+static bool is_of_interpreter(const void *caller) {
+  if (!interpreter.known) {
+    void *function = dlsym(RTLD_DEFAULT, "PyEval_SaveThread");
+    if (function) dl_iterate_phdr(look_for_interpreter, function);
+    interpreter.known = true;
+  }
+  return (uintptr_t)caller >= interpreter.begin && (uintptr_t)caller < interpreter.end;
+}
+
+int pthread_cond_timedwait(pthread_cond_t *condition, pthread_mutex_t *mutex, time_of time) {
+  LIBC(int, pthread_cond_timedwait, (pthread_cond_t *, pthread_mutex_t *, time_of));
+  const int call = sleeps_by_pthread_cond_timedwait;
+  bool recorded = is_followed(call) && !is_of_interpreter(__builtin_return_address(0)) &&
+                  begin_sleep(call, at_either(time));
+  int result = behind(condition, mutex, time);
+  if (recorded) end_sleep(call);
+  return result;
+}
+
+// Files of timers, as bits; a bit stays when its file is closed, so the kernel is asked as well.
+static _Atomic uint64_t timer_files[64];
+
+int timerfd_create(int clock, int flags) {
+  LIBC(int, timerfd_create, (int, int));
+  int file = behind(clock, flags);
+  if (file >= 0 && file < 64 * 64) timer_files[file / 64] |= UINT64_C(1) << file % 64;
+  return file;
+}
+
+// Until when reading the file of a timer sleeps; NO_SLEEP: it does not, or it is no such file.
+static uint64_t until_timer(int file) {
+  struct itimerspec left;
+  int before = errno;
+  bool is_timer = file >= 0 && file < 64 * 64 && (timer_files[file / 64] >> file % 64 & 1) &&
+                  !(fcntl(file, F_GETFL) & O_NONBLOCK) && timerfd_gettime(file, &left) == 0;
+  errno = before;
+  return is_timer ? 0 : NO_SLEEP;
+}
+
+ssize_t read(int file, void *buffer, size_t size) {
+  LIBC(ssize_t, read, (int, void *, size_t));
+  bool recorded =
+    is_followed(sleeps_by_timerfd) && begin_sleep(sleeps_by_timerfd, until_timer(file));
+  ssize_t result = behind(file, buffer, size);
+  if (recorded) end_sleep(sleeps_by_timerfd);
+  return result;
+}
+
+// An executor waits for work. Whatever the middleware waits by is no sleep of its own then.
+struct duration {  // rmw_time_t
+  uint64_t seconds, nanoseconds;
+};
+
+static uint64_t until_work(const struct duration *time) {
+  if (!time || time->seconds > 1000000000u) return 0;  // for ever
+  return in(time->seconds * 1000000000u + time->nanoseconds);
+}
+
+int rmw_wait(void *subscriptions, void *conditions, void *services, void *clients, void *events,
+             void *set, const struct duration *time) {
+  BEHIND(rmw_wait, void *, void *, void *, void *, void *, void *, const struct duration *);
+  bool recorded = (thread.publishes || thread.is_named) && is_followed(sleeps_by_rmw_wait) &&
+                  begin_sleep(sleeps_by_rmw_wait, until_work(time));
+  int result = behind(subscriptions, conditions, services, clients, events, set, time);
+  if (recorded) end_sleep(sleeps_by_rmw_wait);
+  return result;
+}
