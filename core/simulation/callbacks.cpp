@@ -19,7 +19,7 @@ bool Engine::begin_body(Thread & thread) {
       if (!complete(thread)) return end(thread);
       break;
     case Body::store:
-      entity.loop->stored[entity.description->input] = thread.carried;
+      store(thread);
       return end(thread);
     case Body::compute:
       break;

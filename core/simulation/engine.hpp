@@ -120,6 +120,7 @@ private:
   Nanoseconds computing_time(Stream & stream);
 
   // loops.cpp: threads that are in a loop
+  void store(const Thread & thread);
   void begin_instance(Thread & thread);
   void use_stored(Thread & thread);
   void end_instance(Thread & thread);

@@ -9,6 +9,15 @@ constexpr std::int64_t clock_nanosleep = 1;  // as `SLEEPING_CALLS` in event_dec
 
 }  // namespace
 
+// Stores the message of an executor's thread for the loop of its process.
+void Engine::store(const Thread & thread) {
+  const Entity & entity = *thread.entity;
+  LoopAtWork::Stored & stored = entity.loop->inputs[entity.description->input];
+  if (stored.since < now_) stored.before = stored.newest;
+  stored.newest = thread.carried;
+  stored.since = now_;
+}
+
 // Begins an instance of the thread's loop, when the thread has slept.
 void Engine::begin_instance(Thread & thread) {
   log(TracePoint::wake, now_, &thread, {clock_nanosleep, thread.used});
@@ -22,22 +31,24 @@ void Engine::begin_instance(Thread & thread) {
 }
 
 // Gives the thread what the newest message of each input carries: the stamp of the first, and the
-// chain of the one that is on it.
+// chain of the one that is on it. Its first use is the reaction to a message; when it is used
+// again, it is not on the chain any more.
 void Engine::use_stored(Thread & thread) {
-  const LoopAtWork & loop = *thread.loop;
   thread.carried = Carried{};
   thread.carried.origin = now_;
-  for (Place input = 0; input < loop.stored.size(); ++input) {
-    if (!loop.stored[input]) continue;
-    const Carried & carried = *loop.stored[input];
-    if (input == 0) thread.carried.origin = carried.origin;
-    if (!carried.chain_start) continue;
-    thread.carried.chain_start = carried.chain_start;
-    thread.carried.instance = carried.instance;
+  auto & inputs = thread.loop->inputs;
+  for (Place input = 0; input < inputs.size(); ++input) {
+    auto & used = inputs[input].since < now_ ? inputs[input].newest : inputs[input].before;
+    if (!used) continue;
+    if (input == 0) thread.carried.origin = used->origin;
+    if (!used->chain_start) continue;
+    thread.carried.chain_start = used->chain_start;
+    thread.carried.instance = used->instance;
+    used->chain_start.reset();
   }
 }
 
-// Ends an instance of the thread's loop. The first one that used a message is the reaction to it.
+// Ends an instance of the thread's loop.
 void Engine::end_instance(Thread & thread) {
   if (thread.loop->description->ends_chain) note_latency(thread.carried);
 }

@@ -45,7 +45,7 @@ Engine::Engine(Description description, Source source)
   }
   for (const auto & loop : description_.loops) {
     loops_.push_back({&loop, nullptr, {}});
-    loops_.back().stored.resize(loop.inputs);
+    loops_.back().inputs.resize(loop.inputs);
   }
   // They will point to each other, so each list gets its size before the first pointer is taken.
   threads_.resize(description_.threads.size());

@@ -131,9 +131,17 @@ struct Synchroniser {
 
 // A loop, and what the executor of its process has stored for it.
 struct LoopAtWork {
+  // What the newest message of an input carries, and the newest one from before the instant
+  // `since`. An instance that begins at that instant uses the latter.
+  struct Stored {
+    std::optional<Carried> newest;
+    std::optional<Carried> before;
+    Nanoseconds since{0};
+  };
+
   const LoopDescription * description;
   Entity * entity{nullptr};
-  std::vector<std::optional<Carried>> stored;  // of each input, what its newest message carries
+  std::vector<Stored> inputs;
 };
 
 struct Entity {

@@ -15,6 +15,7 @@ from chainshaper.planning.chain_plan import ReceiverPlace, Server
 from chainshaper.planning.plan import Plan
 from chainshaper.robot.gate import values_of
 from chainshaper.simulation.system import ROLES, Entity, SimulatedPublisher, System
+from chainshaper.values.application import LOOP_END
 from chainshaper.values.errors import InputError
 from chainshaper.workload.description import (
     MOST_THREADS,
@@ -333,12 +334,14 @@ class Machine:
         return len(self._synchronisers) - 1
 
     def _loop(self, entity: Entity) -> _core.LoopDescription:
-        pid, reads = self._system.processes[entity.process].pid, entity.described.reads
+        process, reads = self._system.processes[entity.process], entity.described.reads
         threads = [(info.pid, info.role) for info in self._system.threads]
-        # What still arrives when timers have ended is used.
-        last_ns = self._timing.stop_ns if reads else self._timing.last_timer_ns
         return _core.LoopDescription(
-            thread=threads.index((pid, "loop")), inputs=len(reads), last_ns=last_ns
+            thread=threads.index((process.pid, "loop")),
+            inputs=len(reads),
+            # What still arrives when timers have ended is used.
+            last_ns=self._timing.stop_ns if reads else self._timing.last_timer_ns,
+            ends_chain=self._system.chain.topics[-1:] == (process.node + LOOP_END,),
         )
 
     def _set_body(

@@ -282,9 +282,8 @@ def with_recorded_times(
 ) -> Application:
     """Have execution times drawn from a recording of the application, in stretches of ``block``.
 
-    Gates keep what they have: they compute nothing. So do loops, which are no callbacks. Callbacks
-    of a node with the same period or topic are told apart by the order in which they were
-    registered.
+    Gates keep what they have: they compute nothing. Callbacks of a node with the same period or
+    topic are told apart by the order in which they were registered.
 
     Raises InputError: a callback of the application is not in the recording, or its CPU time is
     not.
@@ -300,10 +299,13 @@ def with_recorded_times(
     return application.model_copy(update={"nodes": nodes})
 
 
-_Trigger: TypeAlias = str | int  # a topic, or a timer's period
+_Trigger: TypeAlias = str | int  # a topic, a timer's period, or `_LOOP`
+_LOOP = "its loop"  # of which a node has one
 
 
 def _triggers(callback: CallbackDescription) -> tuple[_Trigger, ...]:
+    if callback.loop_ns is not None:
+        return (_LOOP,)
     return callback.subscriptions if callback.timer_ns is None else (callback.timer_ns,)
 
 
@@ -321,9 +323,6 @@ def _with_times(
     described = Counter(trigger for callback in node.callbacks for trigger in _triggers(callback))
     before = Counter[_Trigger]()
     for callback in node.callbacks:
-        if callback.loop_ns is not None:
-            yield callback
-            continue
         parts: list[pl.DataFrame] = []
         for trigger in _triggers(callback):
             candidates, place = recorded.get(trigger, ()), before[trigger]
@@ -361,7 +360,8 @@ def _computing_times(flow: DataFlow) -> dict[tuple[str, _Trigger], list[pl.DataF
         published: whether it published.
     """
     published = flow.publications.group_by("instance").agg(first=pl.col("time").min())
-    callbacks = flow.objects.callbacks.select("callback_id", "node", "topic", "period_ns")
+    of_callback = ("callback_id", "node", "topic", "period_ns", "kind")
+    callbacks = flow.objects.callbacks.select(of_callback)
     frame = (
         flow.instances.join(published, on="instance", how="left")
         .join(callbacks.unique("callback_id"), on="callback_id")
@@ -373,9 +373,10 @@ def _computing_times(flow: DataFlow) -> dict[tuple[str, _Trigger], list[pl.DataF
         .sort("callback_id")  # they are numbered in order of registration
     )
     frames: dict[tuple[str, _Trigger], list[pl.DataFrame]] = {}
-    columns = ("callback_id", "node", "topic", "period_ns")
-    for (_, node, topic, period), rows in frame.group_by(*columns, maintain_order=True):
-        trigger = str(topic) if period is None else int(period)
+    for (_, node, topic, period, kind), rows in frame.group_by(*of_callback, maintain_order=True):
+        trigger: _Trigger = str(topic) if period is None else int(period)
+        if kind == "loop":
+            trigger = _LOOP
         instances = rows.select("start", "used", "published")
         frames.setdefault((str(node), trigger), []).append(instances)
     return frames

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from chainshaper.analysis.chains import find_chain
 from chainshaper.planning.chain_plan import ReceiverPlace, Server, Thread
 from chainshaper.planning.plan import Plan
-from chainshaper.values.application import ApplicationGraph, Callback, Chain, Node
+from chainshaper.values.application import LOOP_END, ApplicationGraph, Callback, Chain, Node
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import ThreadInfo
 from chainshaper.workload.description import (
@@ -229,6 +229,17 @@ def _receivers(
     }
 
 
+def _publishes(
+    entity: Entity,
+    processes: Sequence[SimulatedProcess],
+    publishers: Sequence[SimulatedPublisher],
+) -> tuple[str, ...]:
+    """The topics of an entity; those of a loop are also of what is stored for it, with its end."""
+    if entity.described.loop_ns is None:
+        return tuple(publishers[publisher].topic for publisher in entity.publishers)
+    return (*entity.described.publishes, processes[entity.process].node + LOOP_END)
+
+
 def _graph(
     processes: Sequence[SimulatedProcess],
     entities: Sequence[Entity],
@@ -242,16 +253,18 @@ def _graph(
     callbacks = [
         Callback(
             id=number,
-            kind="subscription" if entity.topic is not None else "timer",
+            kind="loop"
+            if entity.kind == "loop"
+            else "timer"
+            if entity.topic is None
+            else "subscription",
             node=processes[entity.process].node,
             pid=processes[entity.process].pid,
             handle=number,
             topic=entity.topic,
             period_ns=None if entity.topic is not None else entity.described.period_ns,
-            publishes=entity.described.publishes
-            if entity.stores
-            else tuple(publishers[publisher].topic for publisher in entity.publishers),
-            passes_on=entity.described.publishes if entity.stores else (),
+            publishes=_publishes(entity, processes, publishers),
+            passes_on=_publishes(entity, processes, publishers) if entity.stores else (),
         )
         for number, entity in enumerate(entities)
     ]

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_origin
 from pydantic import Field, create_model, model_validator
 
 from chainshaper.robot.gate import Gate, GateModes, Late, limit_of
+from chainshaper.values.application import LOOP_END
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Publication
 from chainshaper.values.yaml_file import (
@@ -469,6 +470,7 @@ class Application(Part):
                 raise wrong_value("is published by no node: remove it", "topics", topic)
         # A run takes a while, so a chain that could not be found in its recording is refused here.
         known = {*published, *map(node_name, self.nodes)}
+        known |= {node_name(name) + LOOP_END for name, node in self.nodes.items() if node.loop}
         for way_point in map(str.strip, self.chain.split("..")):
             if "/" + way_point.removeprefix("/") not in known:
                 reason = f"no topic or node is called {way_point!r}: write way points of "
