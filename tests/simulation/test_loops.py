@@ -7,17 +7,18 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import polars as pl
 import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from loops_by_hand import instances_of
+from loops_seen import awake, of_node, used
 from schedules import MS, application, begin_of, ran, simulated
 from test_properties import SETTINGS
 
+from chainshaper.analysis import analyse_latency
 from chainshaper.simulation import simulate, simulate_latencies
-from chainshaper.simulation.simulating import START_NS
+from chainshaper.simulation.simulating import START_NS, with_recorded_times
 from chainshaper.values.event_declarations import SLEEPING_CALLS
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application
@@ -43,26 +44,6 @@ nodes:
 
 def chain(loop: str = "execution: {constant: 2ms}", **simulation: Any) -> Application:
     return application(CHAIN.replace("LOOP", loop), **simulation)
-
-
-def of_node(recording: Recording, table: str, node: str) -> pl.DataFrame:
-    (pid,) = (pid for pid, name in recording.info.processes.items() if name == f"/{node}")
-    return recording.events[table].filter(pid=pid)
-
-
-def awake(recording: Recording, node: str = "controller") -> list[tuple[int, int, int]]:
-    """When instances began and ended, and until when the thread slept then (ns)."""
-    begins = of_node(recording, "thread_wake", node)["time"].to_list()
-    sleeps = of_node(recording, "thread_sleep", node).select("time", "until").rows()
-    if sleeps and begins and sleeps[0][0] < begins[0]:
-        sleeps = sleeps[1:]
-    return [(begin, *sleep) for begin, sleep in zip(begins, sleeps, strict=False)]
-
-
-def used(recording: Recording, node: str = "seen") -> dict[int, int]:
-    """The stamp of the message that each instance used, by when it published (ns)."""
-    table = of_node(recording, "gate_release", node)
-    return dict(table.select("source_timestamp", "origin").iter_rows())
 
 
 def in_ms(recording: Recording, *times: int) -> tuple[float, ...]:
@@ -185,6 +166,57 @@ def test_of_several_messages_before_an_instance_the_newest_is_used() -> None:
     latencies = simulate_latencies(application(text), cycles=6)
     # From 20 ms on: scans at 20, 24, 28, …; the loop begins at 25, 33, 41.
     assert list(latencies) == [-1, 2 * MS, -1, 2 * MS, -1, 2 * MS]
+
+
+@pytest.mark.parametrize("chain_text", ["/scan../controller:end", "/scan../command"])
+@pytest.mark.parametrize("period", ["20ms", "4ms"])
+def test_latencies_are_those_that_the_analysis_finds(
+    tmp_path: Path, chain_text: str, period: str
+) -> None:
+    text = CHAIN.replace("LOOP", "execution: {uniform: [100us, 9ms]}").replace(
+        "20ms,", f"{period},"
+    )
+    text = text.replace("/scan../command", chain_text)
+    costs = {"wake_up": {"uniform": ["0us", "100us"]}, "delivery": {"uniform": ["0us", "8ms"]}}
+    described = application(text, **costs)
+    recording = simulate(described, tmp_path / "recording", cycles=200)
+    table = analyse_latency(recording, chain_text).traversals.sort("start")
+    latencies = table["latency_ns"].fill_null(-1).to_list()
+    assert simulate_latencies(described, cycles=200).tolist() == latencies
+    assert len([latency for latency in latencies if latency > 0]) > 100
+
+
+def test_a_chain_may_end_with_an_instance_that_publishes_nothing(tmp_path: Path) -> None:
+    text = """
+    chain: /scan../controller
+    nodes:
+      sensor: {core: 2, callbacks: [{timer: 20ms, publishes: [/scan]}]}
+      controller:
+        callbacks: [{loop: 8ms, phase: 1ms, reads: [/scan], execution: {constant: 2ms}}]
+    """
+    described = application(text, delivery={"constant": "3ms"})
+    assert list(simulate_latencies(described, cycles=4)) == [7 * MS, 11 * MS, 7 * MS, 11 * MS]
+    recording = simulate(described, tmp_path / "recording", cycles=4)
+    measured = analyse_latency(recording, described.chain)
+    assert measured.chain.topics == ("/scan", "/controller:end")
+    assert list(measured.traversals["latency_ns"]) == [7 * MS, 11 * MS, 7 * MS, 11 * MS]
+
+
+def test_the_first_use_counts_where_an_instance_begins_as_a_message_arrives(tmp_path: Path) -> None:
+    """What is stored at the instant at which an instance begins is the next one's."""
+    described = chain(delivery={"constant": "5ms"})
+    assert list(simulate_latencies(described, cycles=2)) == [15 * MS, 11 * MS]
+    recording = simulate(described, tmp_path / "recording", cycles=2)
+    latencies = analyse_latency(recording, "/scan../command").traversals["latency_ns"]
+    assert list(latencies) == [15 * MS, 11 * MS]
+
+
+def test_recorded_execution_times_of_a_loop_are_drawn_again(tmp_path: Path) -> None:
+    described = chain("execution: {uniform: [1ms, 12ms]}, afterwards: {constant: 1ms}")
+    recording = simulate(described, tmp_path / "recording", cycles=50)
+    drawn = with_recorded_times(described, recording).nodes["controller"].callbacks[0].execution
+    assert drawn.samples_ns is not None
+    assert 1 * MS <= min(drawn.samples_ns) < max(drawn.samples_ns) <= 12 * MS
 
 
 # Random applications beside a simulator of loops that is written for nothing else.
