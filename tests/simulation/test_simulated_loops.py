@@ -4,6 +4,7 @@ What an instance used is seen by the stamp that it passed on, in the rows of a g
 """
 
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,12 @@ from schedules import MS, application, begin_of, ran, simulated
 from test_properties import SETTINGS
 
 from chainshaper.analysis import analyse_latency
+from chainshaper.analysis.chains import SeveralPathsError
 from chainshaper.simulation import simulate, simulate_latencies
 from chainshaper.simulation.simulating import START_NS, with_recorded_times
 from chainshaper.values.event_declarations import SLEEPING_CALLS
 from chainshaper.values.recording import Recording
-from chainshaper.workload.description import Application
+from chainshaper.workload.description import Application, CallbackDescription
 from chainshaper.workload.timing import timing_of
 
 CHAIN = """
@@ -50,13 +52,19 @@ def in_ms(recording: Recording, *times: int) -> tuple[float, ...]:
     return tuple((time - begin_of(recording)) / MS for time in times)
 
 
+def uses(recording: Recording) -> list[tuple[float, ...]]:
+    """When each instance published, and the stamp of what it used (ms)."""
+    seen = [in_ms(recording, *pair) for pair in used(recording).items()]
+    return [pair for pair in seen if pair[0] >= 0]
+
+
 def test_a_loop_sleeps_until_multiples_of_its_period_and_uses_the_newest_message(
     tmp_path: Path,
 ) -> None:
     recording = simulated(tmp_path, chain(delivery={"constant": "3ms"}), cycles=2)
     instances = [in_ms(recording, *times) for times in awake(recording)]
     assert instances[:4] == [(5, 7, 13), (13, 15, 21), (21, 23, 29), (29, 31, 37)]
-    stamps = [in_ms(recording, *pair) for pair in used(recording).items()]
+    stamps = uses(recording)
     # The scan of 0 is there at 3, that of 20 at 23, when the instance of 21 has begun.
     assert stamps[:5] == [(7, 0), (15, 0), (23, 0), (31, 20), (39, 20)]
     (call,) = set(recording.events["thread_sleep"]["call"])
@@ -72,8 +80,7 @@ def test_what_is_stored_a_nanosecond_before_an_instance_begins_is_used(
     tmp_path: Path, delivery: str, stamp: int
 ) -> None:
     recording = simulated(tmp_path, chain(delivery={"constant": delivery}), cycles=2)
-    published, origin = next(iter(used(recording).items()))
-    assert in_ms(recording, published, origin) == (7, stamp)
+    assert uses(recording)[0] == (7, stamp)
 
 
 def test_costs_are_those_of_the_loops_thread(tmp_path: Path) -> None:
@@ -83,7 +90,7 @@ def test_costs_are_those_of_the_loops_thread(tmp_path: Path) -> None:
     recording = simulated(tmp_path, chain(loop, **each), cycles=2)
     # It wakes up from 5 to 5.5, computes until 7.5, publishes until 8.5, and goes on until 9.5.
     assert in_ms(recording, *awake(recording)[0]) == (5.5, 9.5, 13)
-    assert in_ms(recording, next(iter(used(recording)))) == (7.5,)
+    assert uses(recording)[0] == (7.5, 0.5)
 
 
 def test_multiples_that_an_instance_missed_are_left_out(tmp_path: Path) -> None:
@@ -129,7 +136,7 @@ def test_the_stamp_is_that_of_the_first_topic_that_it_reads(tmp_path: Path) -> N
     text = text.replace("LOOP", "execution: {constant: 1ms}")
     text += "  late: {core: 5, callbacks: [{timer: 20ms, phase: 4ms, publishes: [/late]}]}\n"
     recording = simulated(tmp_path, application(text))
-    stamps = [in_ms(recording, *pair) for pair in used(recording).items()]
+    stamps = uses(recording)
     assert stamps[:3] == [(6, 4), (14, 4), (22, 4)]
 
 
@@ -140,10 +147,9 @@ def test_before_anything_has_arrived_an_instance_stamps_its_message_itself(tmp_p
     text = text.replace("chain: /scan../command", "chain: /tick../tock")
     text += "  clock: {core: 5, callbacks: [{timer: 20ms, publishes: [/tick]}]}\n"
     text += "  echo: {core: 5, callbacks: [{subscription: /tick, publishes: [/tock]}]}\n"
-    recording = simulated(tmp_path, application(text))
-    stamps = [in_ms(recording, *pair) for pair in used(recording).items()]
+    stamps = uses(simulated(tmp_path, application(text), cycles=6))
     assert stamps[0] == (6, 5)
-    assert (70, 65) in stamps or (78, 65) in stamps
+    assert stamps[7:10] == [(62, 61), (70, 65), (78, 65)]
 
 
 def test_a_loop_that_reads_nothing_ends_with_the_timers(tmp_path: Path) -> None:
@@ -183,7 +189,7 @@ def test_latencies_are_those_that_the_analysis_finds(
     table = analyse_latency(recording, chain_text).traversals.sort("start")
     latencies = table["latency_ns"].fill_null(-1).to_list()
     assert simulate_latencies(described, cycles=200).tolist() == latencies
-    assert len([latency for latency in latencies if latency > 0]) > 100
+    assert len([latency for latency in latencies if latency > 0]) > 80
 
 
 def test_a_chain_may_end_with_an_instance_that_publishes_nothing(tmp_path: Path) -> None:
@@ -261,6 +267,12 @@ def loops(draw: st.DrawFn) -> dict[str, Any]:
     return {"chain": "/s0", "nodes": nodes, "simulation": {"interrupts": 0.0, **costs}}
 
 
+def loop_of(described: Application, name: str) -> CallbackDescription:
+    loop = described.nodes[name].loop
+    assert loop is not None
+    return loop
+
+
 @SETTINGS
 @given(loops())
 def test_random_loops_are_those_of_a_second_simulator(description: dict[str, Any]) -> None:
@@ -286,3 +298,15 @@ def test_random_loops_are_those_of_a_second_simulator(description: dict[str, Any
                 (each.published, each.stamp) for each in by_hand
             ]
             assert by_hand
+            topic = loop_of(described, name).reads[0]
+            if topic.startswith("/s"):
+                first_uses = {each.stamp: each.end for each in reversed(expected[name])}
+                with suppress(SeveralPathsError):  # it leads through another loop as well
+                    table = analyse_latency(recording, f"{topic}../{name}:end").traversals
+                    ends = dict(table.drop_nulls("latency_ns").select("start", "end").iter_rows())
+                    assert {start: end for start, end in ends.items() if end < until} == {
+                        start: end
+                        for start, end in first_uses.items()
+                        if start >= timing.record_from_ns and end < until
+                    }
+                    assert ends
