@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from story import Story
 
 from chainshaper.analysis import application_graph, enumerate_chains, find_chain, load_named_paths
-from chainshaper.analysis.chains import close_names, parse_chain
+from chainshaper.analysis.chains import parse_chain
 from chainshaper.values.application import ApplicationGraph, Callback, Node
+from chainshaper.values.close_names import close_names
 from chainshaper.values.errors import InputError
 
 Edges = tuple[str | None, tuple[str, ...]]

@@ -4,59 +4,11 @@ from typing import Any
 
 import polars as pl
 import pytest
-from story import Callback, Publisher, Story
+from loop_story import LOOP, NANOSLEEP, PID, RMW_WAIT, first_sleep, loop_behind, turn
+from story import Story
 
 from chainshaper.analysis import analyse_latency, callback_statistics, data_flow, graph_of
 from chainshaper.analysis.loops import thread_turns
-from chainshaper.values.event_declarations import SLEEPING_CALLS
-
-NANOSLEEP, RMW_WAIT = (SLEEPING_CALLS.index(name) for name in ("clock_nanosleep", "rmw_wait"))
-PID, LOOP = 20, 22
-
-
-def turn(
-    story: Story,
-    woke: int,
-    sleeps: int,
-    until: int,
-    *,
-    tid: int = LOOP,
-    pid: int = PID,
-    call: int = NANOSLEEP,
-    writes: tuple[tuple[Publisher, int], ...] = (),
-) -> None:
-    """What lies between two sleeps; the thread uses 60 % of the time between them."""
-    used = woke * 10
-    story.event("thread_wake", woke, pid, tid, call=call, thread_time=used)
-    for publisher, time in writes:
-        story.publish(publisher, time, tid)
-    later = {"until": until, "call": call, "thread_time": used + (sleeps - woke) * 6 // 10}
-    story.event("thread_sleep", sleeps, pid, tid, **later)
-
-
-def first_sleep(story: Story, time: int, until: int, tid: int = LOOP, pid: int = PID) -> None:
-    story.event("thread_sleep", time, pid, tid, until=until, call=NANOSLEEP)
-
-
-def loop_behind(
-    inputs: tuple[int, ...], wakes: tuple[int, ...], *, publishes: int = 30
-) -> tuple[Story, Callback]:
-    """/sensor sends /a at these times; a loop of /actor stores it and publishes /cmd.
-
-    The subscription runs 10 behind the sending, on another thread than the loop. A turn lasts 50,
-    publishes 30 after its beginning, and was due 1 before it.
-    """
-    story = Story()
-    timer, sensor = story.source("/sensor", 10, "/a")
-    node = story.node("/actor", PID)
-    reader, cmd = story.subscription(node, "/a"), story.publisher(node, "/cmd")
-    for at in inputs:
-        story.runs(timer, at, at + 2, writes=((sensor, at + 1),))
-        story.runs(reader, at + 10, at + 12, reads=at + 1, tid=21)
-    first_sleep(story, wakes[0] - 60, wakes[0] - 1)
-    for woke, following in zip(wakes, (*wakes[1:], wakes[-1] + 100), strict=True):
-        turn(story, woke, woke + 50, following - 1, writes=((cmd, woke + publishes),))
-    return story, reader
 
 
 def latencies(story: Story, chain: str) -> list[tuple[int, int]]:
@@ -71,7 +23,7 @@ def row(story: Story, node: str = "/actor", kind: str = "loop") -> dict[str, Any
 
 
 def test_a_turn_is_what_lies_between_two_sleeps() -> None:
-    story, _ = loop_behind((0,), (100, 200, 300))
+    story = loop_behind((0,), (100, 200, 300))
     turns = thread_turns(story.tables())
     assert turns.select("start", "end", "due", "left_ns", "execution_ns").rows() == [
         (100, 150, 99, 49, 30),
@@ -92,7 +44,7 @@ def test_a_turn_whose_sleep_was_lost_has_no_end() -> None:
 
 
 def test_a_loop_is_shown_like_a_timer() -> None:
-    story, _ = loop_behind((0, 200), (100, 200, 300, 400))
+    story = loop_behind((0, 200), (100, 200, 300, 400))
     loop = row(story)
     assert (loop["period_ns"], loop["count"], loop["tids"]) == (100, 4, [LOOP])
     assert loop["response_ns"] == {"min": 50, "mean": 50, "max": 50}
@@ -105,18 +57,18 @@ def test_a_loop_is_shown_like_a_timer() -> None:
 
 def test_what_was_stored_last_before_a_turn_is_what_it_used_and_repeats_are_no_cycles() -> None:
     """Two turns for each message: the first use is the reaction."""
-    story, _ = loop_behind((0, 200, 400), (100, 200, 300, 400, 500, 600))
+    story = loop_behind((0, 200, 400), (100, 200, 300, 400, 500, 600))
     assert latencies(story, "/a../cmd") == [(0, 130), (200, 330), (400, 530)]
 
 
 def test_a_message_that_comes_while_a_turn_computes_goes_into_the_next() -> None:
     """It is stored at 110, before the turn publishes at 130."""
-    story, _ = loop_behind((100,), (100, 200))
+    story = loop_behind((100,), (100, 200))
     assert latencies(story, "/a../cmd") == [(100, 230)]
 
 
 def test_of_two_messages_before_a_turn_the_newer_one_is_used() -> None:
-    story, _ = loop_behind((0, 20), (100, 200))
+    story = loop_behind((0, 20), (100, 200))
     analysis = analyse_latency(data_flow(story.tables()), "/a../cmd")
     assert analysis.traversals["latency_ns"].to_list() == [None, 110]
     assert analysis.incomplete == {"not used": 1}
@@ -181,6 +133,46 @@ def test_a_python_loop_that_is_faster_than_its_input_has_a_cycle_for_each_messag
     assert latencies(python_loop(sleeps=sleeps), "/a../cmd") == expected
 
 
+def ages(story: Story, chain: str) -> list[tuple[int, int | None, int | None, int | None]]:
+    """Start of each cycle of the loop; the data's age there and at the end; which use it is."""
+    age = analyse_latency(data_flow(story.tables()), chain).data_age
+    assert age is not None
+    return age.cycles.select("start", "age_at_loop_ns", "age_at_end_ns", "use").rows()
+
+
+def test_the_age_of_what_a_loop_uses_is_known_for_each_of_its_cycles() -> None:
+    """/a leaves its sensor's callback at 0 and 200. The loop publishes 30 behind its start."""
+    story = loop_behind((0, 200, 210), (5, 100, 200, 300, 400))
+    assert ages(story, "/a../cmd") == [
+        (5, None, None, None),  # nothing is stored yet
+        (100, 100, 130, 1),
+        (200, 200, 230, 2),
+        (300, 90, 120, 1),  # of 210, the newer one
+        (400, 190, 220, 2),
+    ]
+    age = analyse_latency(data_flow(story.tables()), "/a../cmd").data_age
+    assert age is not None
+    assert (age.uses, age.most_uses) == ({"never": 1, "once": 0, "again": 2}, 2)
+
+
+def test_the_age_at_the_end_is_that_of_the_output_behind_the_loop() -> None:
+    """/out reads each command 5 behind it and publishes 3 later."""
+    story = loop_behind((0,), (100, 200))
+    drives, out = story.relay("/drive", 30, "/cmd", "/out")
+    for sent in (130, 230):
+        story.runs(drives, sent + 5, sent + 10, reads=sent, writes=((out, sent + 8),))
+    assert latencies(story, "/a../out") == [(0, 138)]
+    assert ages(story, "/a../out") == [(100, 100, 138, 1), (200, 200, 238, 2)]
+
+
+def test_what_a_loop_takes_itself_is_as_old_as_when_it_is_taken() -> None:
+    assert ages(python_loop(sleeps=True), "/a../cmd")[:3] == [
+        (100, 52, 60, 1),
+        (200, 150, 160, 2),
+        (300, 52, 60, 1),
+    ]
+
+
 def named(story: Story, name: str, *, tid: int = PID, is_thread: int = 0) -> None:
     story.event("loop_named", 1, PID, tid, name=name, is_thread=is_thread)
 
@@ -209,10 +201,12 @@ def test_a_named_loop_that_publishes_nothing_ends_a_chain_with_the_end_of_its_tu
     story = controller(is_thread=is_thread)
     assert latencies(story, "/a../manager:end") == [(0, 150), (200, 350)]
     assert row(story, "/manager")["count"] == 4
+    expected = [(100, 100, 150, 1), (200, 200, 250, 2), (300, 100, 150, 1), (400, 200, 250, 2)]
+    assert ages(story, "/a../manager:end") == expected
 
 
 def test_a_loop_that_is_not_named_reads_nothing_of_other_nodes() -> None:
-    story, _ = loop_behind((0,), (100, 200))
+    story = loop_behind((0,), (100, 200))
     other = story.subscription(story.node("/monitor", PID), "/a")
     graph = graph_of(data_flow(story.tables()))
     (monitor,) = (c for c in graph.callbacks if c.handle == other.handle)
@@ -220,7 +214,7 @@ def test_a_loop_that_is_not_named_reads_nothing_of_other_nodes() -> None:
 
 
 def test_a_thread_that_sleeps_irregularly_has_no_period_and_its_spread_is_said() -> None:
-    story, _ = loop_behind((0,), (100, 200, 330, 700, 760, 1000, 1900))
+    story = loop_behind((0,), (100, 200, 330, 700, 760, 1000, 1900))
     assert row(story)["period_ns"] is None
     (note,) = (n for n in data_flow(story.tables()).notes if "irregularly" in n)
     assert "usually" in note and "(p95)" in note and "nothing is to be planned" in note
@@ -235,8 +229,65 @@ def test_a_loop_that_is_woken_before_its_time_is_paced_by_data() -> None:
         turn(story, woke, woke + 50, woke + 1000, writes=((out, woke + 10),))
     flow = data_flow(story.tables())
     assert flow.objects.callbacks["kind"].to_list() == ["unknown"]
-    (note,) = (n for n in flow.notes if "paced by data" in n)
-    assert "/driver publishes /points" in note and str(LOOP) in note
+    (note,) = flow.notes
+    assert "/driver publishes /points" in note and str(LOOP) in note and "paced by data" in note
+
+
+def test_a_loop_that_never_sleeps_for_a_time_is_paced_by_data() -> None:
+    """It blocks on a device: that it is followed is all that is known of its thread."""
+    story = Story()
+    node = story.node("/driver", PID)
+    in_cpp(story, node)
+    out = story.publisher(node, "/points")
+    story.event("thread_wake", 100, PID, LOOP, call=0)
+    for at in range(100, 2000, 100):
+        story.publish(out, at, LOOP)
+    flow = data_flow(story.tables())
+    assert flow.objects.callbacks.filter(handle=0)["kind"].to_list() == ["unknown"]
+    assert any("paced by data" in note and str(LOOP) in note for note in flow.notes)
+
+
+def queueing(counts: tuple[int, ...]) -> Story:
+    """A loop that publishes for every message; so many come before each of its turns, 10 apart."""
+    story = Story()
+    timer, sensor = story.source("/sensor", 10, "/a")
+    node = story.node("/actor", PID)
+    reader, cmd = story.subscription(node, "/a"), story.publisher(node, "/cmd")
+    first_sleep(story, 40, 99)
+    for number, count in enumerate(counts):
+        woke = 100 * (number + 1)
+        for place in range(count):
+            at = woke - 50 + 10 * place
+            story.runs(timer, at, at + 2, writes=((sensor, at + 1),))
+            story.runs(reader, at + 4, at + 6, reads=at + 1, tid=21)
+        writes = tuple((cmd, woke + 10 + place) for place in range(count))
+        turn(story, woke, woke + 40, woke + 99, writes=writes)
+    return story
+
+
+def test_a_loop_that_publishes_for_each_message_queues_them() -> None:
+    """Three came before the second turn: each has its own publication, in order."""
+    assert latencies(queueing((1, 3, 0, 1)), "/a../cmd") == [
+        (50, 110),
+        (150, 210),
+        (160, 211),
+        (170, 212),
+        (350, 410),
+    ]
+    assert ages(queueing((1, 3)), "/a../cmd") == [
+        (100, 50, 60, 1),
+        (200, 50, 60, 1),
+        (200, 40, 51, 1),
+        (200, 30, 42, 1),
+    ]
+
+
+def test_a_node_whose_named_loop_may_be_one_of_several_threads_is_named() -> None:
+    story = controller()
+    first_sleep(story, 60, 109, tid=LOOP + 1)
+    turn(story, 110, 120, 209, tid=LOOP + 1)
+    (note,) = (n for n in data_flow(story.tables()).notes if "Name the thread instead" in n)
+    assert f"({LOOP}, {LOOP + 1})" in note
 
 
 def test_two_loops_of_one_thread_are_told_apart_by_what_they_publish() -> None:
@@ -277,7 +328,7 @@ def in_cpp(story: Story, node: Any) -> None:
 
 def test_without_events_of_sleeps_a_thread_that_publishes_regularly_is_a_loop() -> None:
     """Its instances are known by their publications alone."""
-    story, _ = loop_behind((0, 200, 400), tuple(range(100, 1300, 100)))
+    story = loop_behind((0, 200, 400), tuple(range(100, 1300, 100)))
     in_cpp(story, story.node("/actor", PID))
     del story.rows["thread_sleep"], story.rows["thread_wake"]
     loop = row(story)
@@ -288,7 +339,7 @@ def test_without_events_of_sleeps_a_thread_that_publishes_regularly_is_a_loop() 
 
 
 def test_without_sleeps_a_thread_that_publishes_irregularly_is_no_loop() -> None:
-    story, _ = loop_behind((0,), (100, 110, 190, 300, 305, 400, 620, 700, 1100, 1110, 1300))
+    story = loop_behind((0,), (100, 110, 190, 300, 305, 400, 620, 700, 1100, 1110, 1300))
     in_cpp(story, story.node("/actor", PID))
     del story.rows["thread_sleep"], story.rows["thread_wake"]
     kinds = data_flow(story.tables()).objects.callbacks.filter(pl.col("handle") == 0)["kind"]

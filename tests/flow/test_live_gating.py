@@ -143,25 +143,25 @@ def test_a_chain_of_1_6_or_2_4_periods_is_constant_once_a_cycle_and_in_order(
     assert [server.core for server in plan.servers[:-1]] == stages
     assert cycles_until_output(plan) == cycles_later
     ((start, _),) = publish_slots(plan)
-    folder = tmp_path / "shaped"
-    folder.mkdir()
-    shaped = calm_run(
-        lambda place: shape_application(application, Plan.of(plan), place / "rec", cycles=28),
-        folder,
-    )
-    analysis = measure_latency(shaped).analysis
-    latencies = analysis.traversals.filter(~pl.col("disturbed"))["latency_ns"]
+    runs: list[pl.DataFrame] = []
+    # Where the machine stalls in most cycles, several runs have enough that it left alone.
+    while sum(run.filter(~pl.col("disturbed")).height for run in runs) <= 12:
+        assert len(runs) < 20
+        place = tmp_path / f"shaped{len(runs)}"
+        shaped = shape_application(application, Plan.of(plan), place, cycles=28)
+        runs.append(measure_latency(shaped).analysis.traversals)
+    latencies = pl.concat(runs).filter(~pl.col("disturbed"))["latency_ns"]
     planned = latencies - cycles_later * 100 * MS - start
     assert planned.min() >= 0
-    assert latencies.len() > 12
     # Beside busy processes single outputs leave some ms late: nine in ten within a tenth of what
     # the latencies were apart before, and more than half at once.
     before = measure_latency(profile).analysis.traversals["latency_ns"].drop_nulls().to_numpy()
     half, nine_in_ten = np.quantile(planned.to_numpy(), (0.5, 0.9))
     assert half < MS
     assert nine_in_ten < np.ptp(before) / 10
-    ends = analysis.traversals["end"].drop_nulls().diff().drop_nulls()
-    assert ends.min() > 0  # type: ignore[operator]
+    for run in runs:
+        ends = run["end"].drop_nulls().diff().drop_nulls()
+        assert ends.min() > 0  # type: ignore[operator]
     assert not leftovers()
 
 

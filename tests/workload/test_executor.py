@@ -20,6 +20,7 @@ from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain
 
 from chainshaper.flow.plan import plan_recording
 from chainshaper.planning import PlanRequest
+from chainshaper.planning.chain_plan import SENDS_PER_SLOT, SHORTEST_SLOT_NS
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.verify.measure import measure_latency
@@ -362,7 +363,8 @@ def test_the_publication_is_when_the_message_was_sent_not_handed_over(tmp_path: 
 
     longest_ns = int(sends["duration"].max())  # type: ignore[arg-type]
     # No more room than that: a chain that the machine has made long has to fit, too.
-    request = PlanRequest(publication="asynchronous", publish_slot_ns=longest_ns + MS)
+    shortest_ns = max(SHORTEST_SLOT_NS, SENDS_PER_SLOT * longest_ns)
+    request = PlanRequest(publication="asynchronous", publish_slot_ns=shortest_ns)
     plan = plan_recording(recording, request=request).chains[0]
     assert plan.chain.output_depth == 10
     assert plan.evidence.longest_send_ns in sends["duration"].to_list()

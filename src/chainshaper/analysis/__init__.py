@@ -8,11 +8,11 @@ write the same tables (:mod:`chainshaper.values.events`). :func:`analyse_latency
 one chain; every step is a function of its own.
 """
 
+from chainshaper.analysis.caret_paths import load_named_paths as load_named_paths
 from chainshaper.analysis.chains import ChainEnumeration as ChainEnumeration
 from chainshaper.analysis.chains import SeveralPathsError as SeveralPathsError
 from chainshaper.analysis.chains import enumerate_chains as enumerate_chains
 from chainshaper.analysis.chains import find_chain as find_chain
-from chainshaper.analysis.chains import load_named_paths as load_named_paths
 from chainshaper.analysis.disturbance import disturbed as disturbed
 from chainshaper.analysis.flow import DataFlow as DataFlow
 from chainshaper.analysis.flow import callback_instances as callback_instances

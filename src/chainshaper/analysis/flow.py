@@ -14,8 +14,8 @@ For these, instances are assumed (column ``assumed``; they have no ``end`` and n
 * The callback of a service's client, and what an action's client and server do, begin with the
   take as well. They end when the thread's executor looks for work again. Where an event shows
   that, they have an end, and are not ``assumed``.
-* A loop in a thread of its own, of which events show when it sleeps, has an instance for each of its
-  turns (:mod:`~chainshaper.analysis.loops`). These are not ``assumed``: they have an end.
+* A loop in a thread of its own, of which events show when it sleeps, has an instance for each of
+  its turns (:mod:`~chainshaper.analysis.loops`). These are not ``assumed``: they have an end.
 * A driver's thread, a player of recorded data, or a Python timer without `rcl_timer_call` publishes
   outside all callbacks that events show. A topic that its node publishes only like this gets a
   callback with the handle 0 and one instance per publication. Its kind is ``loop`` where the
@@ -622,10 +622,21 @@ def _with_assumed_writers(
         "outside its callbacks (from a thread of its own, from Python, or from a service client's"
         " callback): a chain that begins there is measured from the publication"
     )
-    notes = (
-        f"{node} publishes {topic} {regular if number in periods else other}."
-        for node, topic, number in outside.select("node", "topic", "callback_id").iter_rows()
+    followed = outside_publications.join(
+        events.table(tables, "thread_wake").select("pid", "tid").unique(), on=["pid", "tid"]
     )
+    threads = dict(followed.group_by("callback_id").agg(pl.col("tid").first()).iter_rows())
+    notes = []
+    for node, topic, number in outside.select("node", "topic", "callback_id").iter_rows():
+        text = regular if number in periods else other
+        if number in threads:
+            text = (
+                f"from a thread of its own (thread {threads[number]}) that does not sleep for a"
+                " time, or mostly wakes up before it is over: it is paced by data or by another"
+                " thread, and has no period of its own. A chain that begins there is measured from"
+                " the publication"
+            )
+        notes.append(f"{node} publishes {topic} {text}.")
     objects = replace(objects, callbacks=callbacks, notes=(*objects.notes, *notes))
     all_instances = pl.concat([instances, assumed_instances], how="diagonal").select(
         instances.columns
@@ -638,8 +649,8 @@ def _periods_of_writers(
 ) -> dict[int, int]:
     """Map the callbacks of threads that publish regularly, as a loop does, to their periods (ns).
 
-    Nodes of rclpy are left out, whose timers publish outside callbacks as well; and threads of which
-    events of sleeps show that they are no loops.
+    Nodes of rclpy are left out, whose timers publish outside callbacks as well; and threads of
+    which events of sleeps show that they are no loops.
     """
     in_cpp = objects.callbacks.filter("observed").select("pid", "node").unique()
     sleeping = events.table(tables, "thread_wake").select("pid", "tid").unique()

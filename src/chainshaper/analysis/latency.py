@@ -9,6 +9,7 @@ import numpy.typing as npt
 import polars as pl
 
 from chainshaper.analysis.chains import find_chain
+from chainshaper.analysis.data_age import DataAge, data_age
 from chainshaper.analysis.disturbance import (
     Due,
     disturbed,
@@ -265,6 +266,7 @@ class LatencyAnalysis:
     notes: tuple[str, ...]
     not_begun: int = 0  # cycles of a plan in which the first callback did not run
     period_ns: int | None = None  # of the timer that starts the chain; None: no timer does
+    data_age: DataAge | None = None  # what a loop of the chain worked with; None: it has none
 
     def __repr__(self) -> str:
         return shown(f"LatencyAnalysis({self.chain.spec}: {self.statistics.text})")
@@ -360,6 +362,7 @@ def analyse_latency(
         notes=(*notes, *flow.notes, *traversals.notes),
         not_begun=0 if own_due is None else not_begun(flow, chain, own_due, between, pauses),
         period_ns=timer_period(flow, chain),
+        data_age=data_age(flow, traversals, graph, between),
     )
 
 

@@ -5,15 +5,16 @@ robots is no callback. The tracing library in front of ROS 2 records when such a
 sleep and wakes up (`thread_sleep`, `thread_wake`).
 
 * **A turn** is what lies between two sleeps of a thread. It is an instance of the loop.
-* **A loop** is a thread that publishes outside callbacks, or that the user named. One that publishes
-  for several nodes is a loop of each. Topics that are never published in the same turn belong to
-  different loops of one thread: each has the turns in which it published.
+* **A loop** is a thread that publishes outside callbacks, or that the user named. One that
+  publishes for several nodes is a loop of each. Topics that are never published in the same turn
+  belong to different loops of one thread: each has the turns in which it published.
 * **In Python** no event shows where a callback ends. What is published again, turns after the
   message that its thread took last, is not that callback's: a loop publishes it.
 * **A loop that is paced by data** mostly wakes up before the time for which it wanted to sleep, or
-  waits without one. Its publications count as those of a thread that no sleep explains.
-* **A named loop** (`loop_named`) may publish nothing, as one that writes to hardware. The end of each
-  of its turns counts as a publication on ``NODE:end``, so that a chain can end there.
+  waits without one. Its publications count as those of a thread that no sleep explains; a note
+  says so.
+* **A named loop** (`loop_named`) may publish nothing, as one that writes to hardware. The end of
+  each of its turns counts as a publication on ``NODE:end``, so that a chain can end there.
 
 Without events of sleeps (LTTng, eBPF, older recordings) a thread that publishes regularly counts as
 a loop whose turn begins with its publication (:func:`seems_regular`).
@@ -77,8 +78,8 @@ def thread_turns(tables: events.EventTables) -> pl.DataFrame:
 
     * ``turn``: numbered from 0.
     * ``pid``, ``tid``.
-    * ``start``, ``end``: when the thread woke up, and went to sleep again (ns; ``end`` is null where
-      it did not, or the event was lost).
+    * ``start``, ``end``: when the thread woke up, and went to sleep again (ns; ``end`` is null
+      where it did not, or the event was lost).
     * ``due``: until when it had wanted to sleep (ns; null: not known).
     * ``left_ns``: how long it wanted to sleep behind ``end``; 0 or less: the time was over already.
     * ``call``: by which function it had slept, a place in SLEEPING_CALLS.
@@ -175,8 +176,8 @@ def _outside(placed: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
 def _loops(
     outside: pl.DataFrame, turns: pl.DataFrame, tables: events.EventTables, objects: Objects
 ) -> tuple[list[_Loop], list[str]]:
-    """Find the loops, and say which threads that publish in turns are none."""
-    loops, notes = _named_loops(outside, turns, tables, objects), list[str]()
+    """Find the loops, and say where one thread, or one node, has several of them."""
+    loops, notes = _named_loops(outside, turns, tables, objects)
     taken_over = {(loop.pid, loop.node, tid) for loop in loops for tid in loop.tids}
     for pid, node, topics in _published_together(outside, taken_over):
         written = outside.filter(pl.col("topic").is_in(topics), pid=pid, node=node)
@@ -184,12 +185,6 @@ def _loops(
         of_topics = turns.filter(pl.col("turn").is_in(written["turn"].implode()))
         if _timed_share(of_topics) >= _TIMED_SHARE:
             loops.append(_Loop(pid, node, topics, tids))
-            continue
-        notes.append(
-            f"{node} publishes {', '.join(topics)} from a thread of its own (thread"
-            f" {', '.join(map(str, tids))}) that wakes up before its time to sleep is over: it is"
-            " paced by data, so it has no period of its own."
-        )
     for tid, together in _of_thread(loops).items():
         if len(together) > 1:
             texts = "; ".join(", ".join(loop.topics) for loop in together)
@@ -202,9 +197,9 @@ def _loops(
 
 def _named_loops(
     outside: pl.DataFrame, turns: pl.DataFrame, tables: events.EventTables, objects: Objects
-) -> list[_Loop]:
-    """Find the loops that the user named, one for each thread."""
-    loops = []
+) -> tuple[list[_Loop], list[str]]:
+    """Find the loops that the user named, one for each thread, and say where a node has several."""
+    loops, notes = list[_Loop](), list[str]()
     named = named_loops(tables, objects.nodes).drop("valid_from").unique(maintain_order=True)
     for pid, tid, node, is_thread in named.iter_rows():
         of_process = turns.filter(pid=pid)
@@ -215,7 +210,13 @@ def _named_loops(
         for thread in tids:
             topics = outside.filter(pid=pid, tid=thread, node=node)["topic"].cast(pl.String)
             loops.append(_Loop(pid, node, tuple(topics.unique().sort()), (thread,), named=True))
-    return list(dict.fromkeys(loops))
+        if len(tids) > 1:
+            notes.append(
+                f"the loop of {node} was named by its node, and {len(tids)} threads of its process"
+                f" sleep for a time ({', '.join(map(str, tids))}): each counts as a loop of it."
+                " Name the thread instead."
+            )
+    return list(dict.fromkeys(loops)), notes
 
 
 _Topics: TypeAlias = tuple[int, str, tuple[str, ...]]
@@ -369,7 +370,9 @@ def _notes(loop: _Loop, turns: pl.DataFrame) -> Iterator[str]:
     starts = turns["start"].sort().to_numpy()
     if len(starts) < 3 or _is_regular(starts):
         return
-    low, usual, high = (duration_text(round(v)) for v in np.percentile(np.diff(starts), (5, 50, 95)))
+    low, usual, high = (
+        duration_text(round(v)) for v in np.percentile(np.diff(starts), (5, 50, 95))
+    )
     yield (
         f"the loop of {loop.node} (thread {', '.join(map(str, loop.tids))}) sleeps irregularly:"
         f" usually {usual} lie between its starts, from {low} (p5) to {high} (p95). It has no"
@@ -383,8 +386,8 @@ def loop_figures(
     """Compute what is known of loops beside the figures of all callbacks, a row for each. Columns:
 
     * ``callback_id``.
-    * ``phase_ns``: how long after a multiple of its period, on the clock of events, it usually starts
-      (null: it has no period).
+    * ``phase_ns``: how long after a multiple of its period, on the clock of events, it usually
+      starts (null: it has no period).
     * ``start_jitter_ns``: of its starts behind the end of its time to sleep, the latest less the
       earliest (null: not known).
     * ``overruns``: instances that ended when the next one should have begun (null: not known).
@@ -397,7 +400,9 @@ def loop_figures(
     late = pl.col("start") - pl.col("due")
     figures = rows.sort("start").group_by("callback_id")
     return figures.agg(
-        phase_ns=((pl.col("start").last() + within.median()).round().cast(pl.Int64) % period.last()),
+        phase_ns=(
+            (pl.col("start").last() + within.median()).round().cast(pl.Int64) % period.last()
+        ),
         start_jitter_ns=late.max() - late.min(),
         overruns=pl.when(pl.col("overran").count() > 0).then(pl.col("overran").sum()),
     )

@@ -20,6 +20,9 @@ reason "not used"; no output is missing for them. message_filters has queues ins
 message counts, also where several came before one publication although only one can have been in
 it; ``notes`` says so.
 
+A loop that evidently queues its messages has a publication for each: each of its turns published as
+often as messages had come since the turn before, and some of them several times.
+
 **A message's first use is the reaction.** A timer, or a loop, that is faster than its input uses a
 message again. These repeats are no traversals: they are older data
 (:mod:`~chainshaper.analysis.data_age`). A loop that takes messages itself, in the turn in which it
@@ -105,6 +108,7 @@ class Traversals:
     * ``instance``: its number in the data flow.
     * ``take``, ``start``, ``publish``, ``end``: instants of the instance.
     * ``source_timestamp``: of the message that it took.
+    * ``publication``: number in the data flow of what the message went into (null: nothing).
     * ``communication_ns``: from the previous publication to the start.
     * ``computation_ns``: from the start to the publication, without the waiting.
     * ``waiting_ns``: within the node, of three kinds. From the end of the instance until another
@@ -145,7 +149,7 @@ def traverse(flow: DataFlow, chain: Chain, graph: ApplicationGraph | None = None
         state = _publish(flow, state, hop, [callback.id, *standby], topic)
         if topic in callback.passes_on or (hop and goes_on_elsewhere(graph, callback, topic)):
             reading = readers(graph, callback, topic)
-            state, note = _publish_by_sibling(flow, state, hop, callback, topic, reading)
+            state, note = _publish_by_sibling(flow, state, hop, callback, topic, reading=reading)
             if _keeps_newest(graph, callback, topic):
                 state = _newest_alone(state, hop)
             notes += note
@@ -218,6 +222,7 @@ def _publish_by_sibling(
     hop: int,
     callback: Callback,
     topic: str,
+    *,
     reading: Sequence[Callback],
 ) -> tuple[pl.DataFrame, list[str]]:
     """Fill in what another callback of the node published for the message.
@@ -251,12 +256,16 @@ def _publish_by_sibling(
     if loops:
         matches = pl.concat([matches, _used_in_turn(flow, rows, candidates, loops)])
         matches = matches.sort("later", descending=True, nulls_last=False)  # the first use counts
+        matches = matches.drop_nulls("later").unique("row", keep="last", maintain_order=True)
+        queued = _queued(matches, candidates, loops)
+        matches = matches if queued is None else queued
     matches = matches.filter(pl.col("created") <= pl.col("start"))
     later = by_number(matches, "row", "later", state.height)
     state = state.with_columns(
         pl.coalesce(publication, later), (pl.col(sibling) | later.is_not_null()).alias(sibling)
     )
-    if callback.kind == "service" or MESSAGE_FILTER not in (callback.symbol or MESSAGE_FILTER):
+    stores = MESSAGE_FILTER not in (callback.symbol or MESSAGE_FILTER) or loops
+    if callback.kind == "service" or stores:
         return state, []  # a callback that stores its latest message: old values are its purpose
     reached = state[publication].drop_nulls()
     between = candidates.filter(pl.col("later").is_between(reached.min(), reached.max())).height
@@ -291,6 +300,33 @@ def _used_in_turn(
     return matches.filter(pl.col("turn_began") <= pl.col("start")).select(
         *rows.columns, *(pl.col(name) for name in candidates.columns)
     )
+
+
+def _queued(
+    matches: pl.DataFrame, candidates: pl.DataFrame, loops: Sequence[int]
+) -> pl.DataFrame | None:
+    """Match each message to a publication of its own, where a loop evidently queues them.
+
+    It does if each of its turns published as often as messages had come since the turn before, and
+    some of them several times. None: no event shows that; then the newest message counts.
+    """
+    if matches.is_empty():
+        return None
+    first, last = matches["instance"].min(), matches["instance"].max()
+    of_loops = pl.col("callback_id").is_in(loops) & pl.col("instance").is_between(first, last)
+    written = candidates.filter(of_loops).sort("later")
+    came = matches.group_by("instance").agg(came=pl.len())
+    wrote = written.group_by("instance").agg(wrote=pl.len())
+    turns = wrote.join(came, on="instance", how="left").with_columns(pl.col("came").fill_null(0))
+    if (turns["came"] != turns["wrote"]).any() or turns["wrote"].max() == 1:
+        return None
+    place = pl.int_range(pl.len()).over("instance")
+    messages = matches.sort("start", maintain_order=True)
+    messages = messages.select("row", "start", "instance_of_row", "instance")
+    numbered = messages.with_columns(place=place).join(
+        written.with_columns(place=place), on=["instance", "place"]
+    )
+    return numbered.select(matches.columns)
 
 
 def _keeps_newest(graph: ApplicationGraph, callback: Callback, topic: str) -> bool:
@@ -488,6 +524,7 @@ def _hop(flow: DataFlow, chain: Chain, frame: pl.DataFrame, hop: int) -> pl.Data
             publish=publish,
             end=_looked_up(flow.instances, "end", instance),
             source_timestamp=_looked_up(flow.takes, "source_timestamp", take),
+            publication=f"publication_{hop}",
             communication_ns=sent,
             waiting_ns=waiting,
             via=via.cast(_VIA),

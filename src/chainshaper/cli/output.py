@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 
-SPEAK_EVERY_S = 10.0  # about a stage, where there is no bar
+SPEAK_EVERY_S = 2.0  # about a stage, where there is no bar: nothing is silent for longer
 PATIENCE_S = 2.0  # work that takes longer than this shows its progress
 
 
@@ -149,7 +149,7 @@ def late_progress(title: str) -> Iterator[Progress]:
 def stage_lines(title: str) -> Progress:
     """Show progress as one line per stage, where a bar would disturb what others print.
 
-    A stage that takes long has a line with percent and time left every ten seconds.
+    A stage that takes long has a line with percent and time left every two seconds.
     """
     last, began, spoke = "", 0.0, 0.0
 

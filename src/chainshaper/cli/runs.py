@@ -252,6 +252,12 @@ def record(
     ),
     user: list[str] | None = opt.USERS,
     buffer: int | None = BUFFER,
+    loop: list[str] | None = opt.option(
+        "--loop NAME",
+        "A loop that is no callback, by its node (/name) or its thread's name (preload; may be "
+        "repeated). For threads that publish nothing, as those that write to hardware.",
+        rich_help_panel=opt.TRACING,
+    ),
     watch_stalls: bool = opt.option(
         "--watch-stalls",
         "Have a sleeper on every core notice when the machine itself stands still.",
@@ -277,6 +283,7 @@ def record(
             pids=pid or [],
             users=user or [],
             buffer=buffer and buffer << 20,
+            loops=loop or [],
             watch_stalls=watch_stalls,
             command_stdout=STDERR if json else None,  # standard output is ours
             stop=stop,

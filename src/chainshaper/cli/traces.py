@@ -181,7 +181,9 @@ def latency(
     analysis = measurement.analysis
     values = of_chain.latency_json(measurement, instances=instances)
     values |= of_chain.breakdown_json(analysis)
-    tables = of_chain.latency_table(measurement), of_chain.breakdown_table(analysis)
+    tables = [of_chain.latency_table(measurement), of_chain.breakdown_table(analysis)]
+    if analysis.data_age is not None:
+        tables.append(of_chain.data_age_table(analysis.data_age))
     if out.present(json, values, *tables):
         out.show_line(f"{of_chain.doubts_text(measurement)}; {out.lost_events(recording)}")
         for path in drawn:

@@ -11,9 +11,9 @@ from chainshaper.analysis import (
     load_named_paths,
     recorded_flow,
 )
-from chainshaper.analysis.chains import close_names
 from chainshaper.analysis.graph import ApplicationDescription, services
 from chainshaper.sources.lttng.sessions import table_name
+from chainshaper.values.close_names import close_names
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording, RecordingInfo, event_counts, write_recording
 from chainshaper.verify.measure import opened

@@ -115,6 +115,7 @@ def record_command(
     users: Collection[str | int] = (),
     buffer: int | None = None,
     chain: str | None = None,
+    loops: Sequence[str] = (),
     scheduling: Scheduling | None = None,
     plan: Plan | None = None,
     gate_logs: Sequence[Path] = (),
@@ -129,9 +130,10 @@ def record_command(
     ``command`` is started, and ended with the recording; it prints to ``command_stdout``. Without
     one, `ebpf` and `preload` attach to ``pids`` and their descendants, or to all that ``users`` run
     (as :func:`.find_threads`). Without ``source`` it is `preload`, or `lttng` where there is no
-    command, or a ``buffer`` (the size of LTTng's of a core, in bytes). ``chain`` is noted as the
-    chain of interest, ``plan`` as the plan in force; ``gate_logs`` are where its shaping
-    nodes note what they do. ``watch_stalls`` watches every core for stalls (2 % of it).
+    command, or a ``buffer`` (the size of LTTng's of a core, in bytes). ``loops`` are names of nodes
+    and threads whose loops are recorded although they publish nothing (`preload` only). ``chain``
+    is noted as the chain of interest, ``plan`` as the plan in force; ``gate_logs`` are where its
+    shaping nodes note what they do. ``watch_stalls`` watches every core for stalls (2 % of it).
     ``ask_qos`` has ROS 2 asked for types and QoS of topics, which takes it seconds.
 
     Raises InputError: ``output`` exists, or no such command, process or source does. PlatformError:
@@ -151,7 +153,7 @@ def record_command(
     except OSError as error:
         raise OperationError(f"{parent}: no trace can be written there: {error}") from error
     try:
-        tracer = _tracer(source, folder, command, pids, buffer, users=taken)
+        tracer = _tracer(source, folder, command, pids, buffer, users=taken, loops=loops)
         run = _RecordedRun(
             tracer=tracer,
             folder=folder,
@@ -196,11 +198,17 @@ def _tracer(
     buffer: int | None,
     *,
     users: frozenset[int],
+    loops: Sequence[str] = (),
 ) -> Tracer:
     """Return the tracer that was asked for, or that fits. Raises InputError: there is no such."""
     if source is None:
         # A given buffer, and processes that run already, are LTTng's to answer.
         source = "lttng" if buffer is not None or not command else "preload"
+    if loops and (source != "preload" or not command):
+        raise InputError(
+            "the sleep of a loop is seen by `--source preload` alone, in what it starts itself:"
+            " leave out --loop, or record `--source preload … -- COMMAND`"
+        )
     if source == "lttng":
         return lttng.LttngSession(folder, command, pids, buffer, users)
     if source not in ("ebpf", "preload"):
@@ -210,7 +218,7 @@ def _tracer(
             f"--buffer is about LTTng's buffers: leave it out with `--source {source}`"
         )
     if source == "preload":
-        return preload.PreloadTracer(folder, command, pids, users)
+        return preload.PreloadTracer(folder, command, pids, users, loops)
     return ebpf.EbpfTracer(folder, command, pids, users)
 
 

@@ -171,7 +171,9 @@ def callback_text(callback: Callback) -> str:
     if callback.kind == "timer":
         return f"timer {period_text(callback.period_ns or 0, callback.declared_ns)}"
     if callback.kind == "loop":
-        return f"loop {period_text(callback.period_ns, None) if callback.period_ns else ''}".rstrip()
+        return (
+            f"loop {period_text(callback.period_ns, None) if callback.period_ns else ''}".rstrip()
+        )
     if callback.kind == "unknown":
         return "not known" if callback.handle else "outside callbacks"
     return f"{callback.kind} {callback.topic or ''}".rstrip()

@@ -12,7 +12,13 @@ from typing import Any
 
 import polars as pl
 
-from chainshaper.analysis import REASONS, LatencyAnalysis, LatencyStatistics
+from chainshaper.analysis import (
+    REASONS,
+    LatencyAnalysis,
+    LatencyStatistics,
+    latency_statistics,
+)
+from chainshaper.analysis.data_age import DataAge
 from chainshaper.planning import ChainPlan, publish_slots
 from chainshaper.planning.overruns import expected
 from chainshaper.reporting.tables import (
@@ -80,7 +86,8 @@ def _rows(columns: Sequence[LatencyStatistics | None]) -> dict[str, list[str]]:
 
 
 def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[str, Any]:
-    """A chain's latency as plain data; ``instances`` adds every complete traversal.
+    """A chain's latency as plain data; ``instances`` adds every complete traversal, and every cycle
+    of a loop that it goes through.
 
     If ``stalls_watched`` is false, stalls of the machine are not known, and ``disturbed`` is 0.
     ``late``, ``max_all_ns`` and ``jitter_all_ns`` are over all cycles. Instances have their start
@@ -100,6 +107,7 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
         "subscriber_undisturbed": None if calm is None else asdict(calm),
         "incomplete_by_reason": analysis.incomplete,
         "silent": analysis.silent,
+        "data_age": data_age_json(analysis.data_age),
         "overruns": None if overruns is None else sum(overruns.values()),
         "overruns_by_policy": overruns,
         "overrun_outcomes": {
@@ -119,11 +127,18 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
         "notes": list(analysis.notes),
     }
     if instances:
-        times = (
+        times = [
             (pl.col(end) + info.clock_offset_ns).alias(f"{end}_ns") for end in ("start", "end")
-        )
+        ]
         complete = analysis.traversals.filter("complete")
         result["instances"] = complete.select(*times, "latency_ns", "disturbed").to_dicts()
+        if analysis.data_age is not None:
+            times = [
+                (pl.col(end) + info.clock_offset_ns).alias(f"{end}_ns")
+                for end in ("start", "publish", "end")
+            ]
+            ages = ("age_at_loop_ns", "age_at_end_ns", "use")
+            result["loop_cycles"] = analysis.data_age.cycles.select(*times, *ages).to_dicts()
     return result
 
 
@@ -176,6 +191,40 @@ def latency_table(measurement: Measurement) -> ResultTable:
         # Without a plan outputs are not due at any instant; late means longer than the period.
         title = "longer than the period" if name == LATE[0] and measurement.plan is None else name
         table.add(title, *cells, detail=title in ("median", "99th percentile"))
+    return table
+
+
+def data_age_json(age: DataAge | None) -> dict[str, Any] | None:
+    """What a loop of a chain worked with, as plain data: ages over its cycles, uses of messages."""
+    if age is None:
+        return None
+    known = age.cycles.drop_nulls("traversal")
+    at_end = known["age_at_end_ns"].drop_nulls()
+    return {
+        "loop": age.loop.label,
+        "topic": age.topic,
+        "cycles": age.cycles.height,
+        "at_loop": asdict(latency_statistics(known["age_at_loop_ns"])),
+        "at_end": asdict(latency_statistics(at_end, incomplete=known.height - at_end.len())),
+        "messages": {**age.uses, "most_uses": age.most_uses},
+    }
+
+
+def data_age_table(age: DataAge) -> ResultTable:
+    """Make a table of the age of a loop's data, when it reads them and at the chain's end."""
+    known = age.cycles.drop_nulls("traversal")
+    columns = [known[name].drop_nulls() for name in ("age_at_loop_ns", "age_at_end_ns")]
+    never, once, again = (age.uses[name] for name in ("never", "once", "again"))
+    repeats = f", up to {age.most_uses} times" if again else ""
+    below = (
+        f"Messages used once: {once}; in several cycles: {again}{repeats}; never: {never}. That a"
+        " cycle uses the newest message is inferred; no event shows it."
+    )
+    title = f"Age of the data of {age.loop.label}, over all of its cycles [ms]"
+    table = ResultTable(title, [*words(""), *figures("at the loop", "at the end")], below)
+    for name, cells in _rows([latency_statistics(column) for column in columns]).items():
+        if name != LATE[0]:
+            table.add(name, *cells, detail=name in ("median", "99th percentile"))
     return table
 
 

@@ -140,8 +140,9 @@ def callback_rows(statistics: pl.DataFrame) -> list[dict[str, Any]]:
 def callback_table(statistics: pl.DataFrame) -> ResultTable:
     """Make a table of callbacks: threads, number of instances, execution and response times.
 
-    Execution and response times, and figures of loops, have columns only where there are any. The name of the function has
-    a column in the report. On the terminal it stands behind callbacks that look alike without it.
+    Execution and response times, and figures of loops, have columns only where there are any. The
+    name of the function has a column in the report. On the terminal it stands behind callbacks that
+    look alike without it.
     """
     measured = [name for name in ("execution", "response") if statistics[f"{name}_ns"].count()]
     columns = [*words("node", "callback"), Column("function", words=True, detail=True)]
@@ -165,7 +166,9 @@ def callback_table(statistics: pl.DataFrame) -> ResultTable:
             ms(row[name]) if name != "overruns" or row[name] is None else row[name]
             for name in of_loops
         )
-        table.add(row["node"] or "", shown, symbol, listed(row["tids"]), row["count"], *times, *loop)
+        table.add(
+            row["node"] or "", shown, symbol, listed(row["tids"]), row["count"], *times, *loop
+        )
     return table
 
 

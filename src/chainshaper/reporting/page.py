@@ -24,7 +24,12 @@ from typing import Any, Literal
 import numpy as np
 import polars as pl
 
-from chainshaper.analysis import DataFlow, callback_statistics, recorded_flow
+from chainshaper.analysis import (
+    DataFlow,
+    LatencyAnalysis,
+    callback_statistics,
+    recorded_flow,
+)
 from chainshaper.planning import ChainPlan, Plan, dump_plan, publish_slots
 from chainshaper.planning.overruns import slots_of_latency
 from chainshaper.reporting import latency as of_chain
@@ -203,6 +208,14 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
     return [f"{path} ({number})" for number, path in enumerate(paths, start=1)]
 
 
+def _data_age(analysis: LatencyAnalysis) -> str:
+    """Make the HTML of the table of the age of a loop's data; empty: the chain has no loop."""
+    if analysis.data_age is None:
+        return ""
+    table = of_chain.data_age_table(analysis.data_age)
+    return _paragraph(f"{table.title}:") + table.html() + _paragraph(table.caption)
+
+
 def _tables(parts: Sequence[_NamedMeasurement], suffix: str, several: bool) -> dict[str, str]:
     """Make the HTML of a chain's tables, by the placeholders of the template.
 
@@ -217,6 +230,7 @@ def _tables(parts: Sequence[_NamedMeasurement], suffix: str, several: bool) -> d
     hops = (
         _paragraph(f"{part.name}, all complete cycles [ms]:")
         + of_chain.breakdown_table(part.measurement.analysis).html()
+        + _data_age(part.measurement.analysis)
         for part in parts
     )
     plans = (

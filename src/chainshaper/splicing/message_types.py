@@ -5,7 +5,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from chainshaper.analysis.chains import close_names
+from chainshaper.values.close_names import close_names
 from chainshaper.values.errors import InputError, text_of
 
 _TYPE = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")

@@ -191,7 +191,8 @@ static void find_rseq(void) {
   struct rseq_area *rseq = rseq_at(usable);
   for (int try = 0; rseq && try < 3; try++) {
     rseq->section = (uintptr_t)&no_section;
-    nanosleep(&(struct timespec){0, 1}, NULL);
+    // By its number: we stand in front of nanosleep ourselves, which would record it as the node's.
+    syscall(SYS_clock_nanosleep, CLOCK_MONOTONIC, 0, &(struct timespec){0, 1}, NULL);
     if (rseq->section) usable = 0;
   }
   rseq_offset = usable;  // in one write: another thread may be here too, and comes to the same result
@@ -709,15 +710,12 @@ static void end_sleep(int call) {
   errno = before;
 }
 
-// The function of the C library behind ours. Of condition variables dlsym may find an old version.
-static void *function_of_libc(const char *name) {
-  void *address = dlvsym(RTLD_NEXT, name, "GLIBC_2.3.2");
-  return address ? address : dlsym(RTLD_NEXT, name);
-}
-
+// `behind`: the function of the C library behind ours. A program that looks for one that its C library
+// does not have finds ours, and is told that the kernel lacks it.
 #define LIBC(type, name, parameters) \
   static type(*_Atomic behind) parameters; \
-  if (!behind) behind = (type(*) parameters)function_of_libc(#name)
+  if (!behind) behind = (type(*) parameters)dlsym(RTLD_NEXT, #name); \
+  if (!behind) return (errno = ENOSYS, (type)-1)
 
 #define SLEEPS(type, name, parameters, arguments, call, until) \
   type name parameters { \
@@ -788,7 +786,10 @@ static bool is_of_interpreter(const void *caller) {
 }
 
 int pthread_cond_timedwait(pthread_cond_t *condition, pthread_mutex_t *mutex, time_of time) {
-  LIBC(int, pthread_cond_timedwait, (pthread_cond_t *, pthread_mutex_t *, time_of));
+  static int (*_Atomic behind)(pthread_cond_t *, pthread_mutex_t *, time_of);
+  // On x86 there are two versions, and dlsym may find the one for programs from before 2003.
+  if (!behind) behind = dlvsym(RTLD_NEXT, "pthread_cond_timedwait", "GLIBC_2.3.2");
+  if (!behind) behind = dlsym(RTLD_NEXT, "pthread_cond_timedwait");
   const int call = sleeps_by_pthread_cond_timedwait;
   bool recorded = is_followed(call) && !is_of_interpreter(__builtin_return_address(0)) &&
                   begin_sleep(call, at_either(time));
@@ -807,22 +808,22 @@ int timerfd_create(int clock, int flags) {
   return file;
 }
 
-// Until when reading the file of a timer sleeps; NO_SLEEP: it does not, or it is no such file.
-static uint64_t until_timer(int file) {
+// Whether reading a file sleeps until a timer expires.
+static bool is_timer(int file) {
+  if (file < 0 || file >= 64 * 64 || !(timer_files[file / 64] >> file % 64 & 1)) return false;
   struct itimerspec left;
   int before = errno;
-  bool is_timer = file >= 0 && file < 64 * 64 && (timer_files[file / 64] >> file % 64 & 1) &&
-                  !(fcntl(file, F_GETFL) & O_NONBLOCK) && timerfd_gettime(file, &left) == 0;
+  bool sleeps = !(fcntl(file, F_GETFL) & O_NONBLOCK) && timerfd_gettime(file, &left) == 0;
   errno = before;
-  return is_timer ? 0 : NO_SLEEP;
+  return sleeps;
 }
 
 ssize_t read(int file, void *buffer, size_t size) {
   LIBC(ssize_t, read, (int, void *, size_t));
-  bool recorded =
-    is_followed(sleeps_by_timerfd) && begin_sleep(sleeps_by_timerfd, until_timer(file));
+  const int call = sleeps_by_timerfd;
+  bool recorded = is_timer(file) && is_followed(call) && begin_sleep(call, 0);
   ssize_t result = behind(file, buffer, size);
-  if (recorded) end_sleep(sleeps_by_timerfd);
+  if (recorded) end_sleep(call);
   return result;
 }
 

@@ -16,6 +16,7 @@ import polars as pl
 from chainshaper.linux.processes import descendants, run_users
 from chainshaper.linux.threads import parents
 from chainshaper.robot.clocks import clock_offset
+from chainshaper.sources.preload import named_loops
 from chainshaper.sources.preload.in_front import VARIABLE, in_front, installed_library
 from chainshaper.sources.preload.memory import RECORD, TracedProcess
 from chainshaper.sources.preload.running import NO_PROCESS, left_out, memories, name_of
@@ -34,7 +35,10 @@ _CREDENTIALS = struct.Struct("iII")  # struct ucred: pid, uid, gid
 class PreloadTracer:
     """Records with the library in front: a :class:`~chainshaper.sources.Tracer`.
 
-    A thread of its own reads the memories, until ``stop``.
+    A thread of its own reads the memories, until ``stop``. ``loops`` are names of nodes and of
+    threads.
+
+    Raises InputError: a loop cannot have such a name.
     """
 
     def __init__(
@@ -43,7 +47,9 @@ class PreloadTracer:
         command: Sequence[str],
         pids: Sequence[int],
         users: Collection[int] | None = None,
+        loops: Sequence[str] = (),
     ) -> None:
+        self._loops, self._loops_text = loops, named_loops.names_text(loops)
         self._folder, self._pids, self._attaches = folder, pids, not command
         self._users = {os.geteuid(), *(run_users() if users is None else users)}
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -76,7 +82,7 @@ class PreloadTracer:
         self._socket.listen(128)
         self._socket.settimeout(_BETWEEN_LOOKS_S)
         self._reader.start()
-        return {**in_front(library), VARIABLE: name}
+        return {**in_front(library), VARIABLE: name, named_loops.VARIABLE: self._loops_text}
 
     def failure(self) -> str | None:
         return self._failure
@@ -109,6 +115,7 @@ class PreloadTracer:
         lost = sum(process.lost + process.dropped for process in self._processes)
         notes = [f"{self._failure}."] if self._failure else []
         notes += self._refused
+        notes += named_loops.notes(self._loops, tables)
         for process in self._processes:
             if process.damage is not None:
                 name = self._names.get(process.pid, "unknown")
