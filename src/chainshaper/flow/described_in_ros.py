@@ -29,6 +29,7 @@ from chainshaper.values.files import write_whole
 from chainshaper.values.progress import Progress
 from chainshaper.values.recording import Recording, refuse_existing
 from chainshaper.workload.description import Application, origin_timer
+from chainshaper.workload.launcher import LOOP_NAME
 from chainshaper.workload.live import fifo_permitted
 from chainshaper.workload.rclpy_nodes import WrittenNodes, write_rclpy_nodes
 from chainshaper.workload.timing import WARM_UP_CYCLES
@@ -93,6 +94,7 @@ def run_in_ros(
                 source="preload",
                 duration_ns=cycles * period_ns,
                 chain=application.chain,
+                loops=(LOOP_NAME,) if any(node.loop for node in application.nodes.values()) else (),
                 scheduling=_warmed_up(nodes.ready, WARM_UP_CYCLES * period_ns),
                 plan=plan,
                 gate_logs=gates.logs,
