@@ -5,9 +5,9 @@
 This file is run, not imported: by the interpreter that has `rclpy`, where nothing of ours may be
 installed. `ros_nodes.py` writes what it reads.
 
-Its timers expire at multiples of their periods on CLOCK_MONOTONIC, each after its phase; its loop is
-a thread that sleeps until such multiples. They begin when every topic of the node has someone at the
-other end; then the file ``ready`` appears.
+Its timers expire at multiples of their periods on CLOCK_MONOTONIC, each after its phase; its loop
+is a thread that sleeps until such multiples. They begin when every topic of the node has someone at
+the other end; then the file ``ready`` appears.
 """
 
 import ctypes
