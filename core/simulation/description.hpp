@@ -138,7 +138,8 @@ struct SynchroniserDescription {
 };
 
 // A loop sleeps until multiples of its entity's period. Each instance uses the newest message of
-// each input that was stored before the instance began.
+// each input that was stored before the instance began. When timers expire no more, it begins only
+// instances that have something new to use.
 struct LoopDescription {
   Place thread{0};         // its own
   std::size_t inputs{0};   // of so many topics it uses the newest message

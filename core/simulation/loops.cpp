@@ -20,6 +20,9 @@ void Engine::store(const Thread & thread) {
 
 // Begins an instance of the thread's loop, when the thread has slept.
 void Engine::begin_instance(Thread & thread) {
+  const bool timers_ended = thread.loop->entity->due > description_.last_timer_ns;
+  if (timers_ended && !thread.loop->has_news(now_)) return fall_asleep(thread);
+  thread.loop->begun = now_;
   log(TracePoint::wake, now_, &thread, {clock_nanosleep, thread.used});
   use_stored(thread);
   thread.entity = thread.loop->entity;

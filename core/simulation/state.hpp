@@ -5,6 +5,7 @@
 
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 #include <deque>
 #include <optional>
@@ -136,12 +137,20 @@ struct LoopAtWork {
   struct Stored {
     std::optional<Carried> newest;
     std::optional<Carried> before;
-    Nanoseconds since{0};
+    Nanoseconds since{-1};
   };
+
+  // Whether an instance that begins now has something that the one before had not.
+  bool has_news(Nanoseconds now) const {
+    return std::any_of(inputs.begin(), inputs.end(), [&](const Stored & stored) {
+      return stored.since >= begun && stored.since < now;
+    });
+  }
 
   const LoopDescription * description;
   Entity * entity{nullptr};
   std::vector<Stored> inputs;
+  Nanoseconds begun{0};  // when the last instance began
 };
 
 struct Entity {

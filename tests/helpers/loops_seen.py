@@ -12,12 +12,16 @@ def of_node(recording: Recording, table: str, node: str) -> pl.DataFrame:
 
 
 def awake(recording: Recording, node: str = "controller") -> list[tuple[int, int, int]]:
-    """When instances began and ended, and until when the thread slept then (ns)."""
-    begins = of_node(recording, "thread_wake", node)["time"].to_list()
-    sleeps = of_node(recording, "thread_sleep", node).select("time", "until").rows()
-    if sleeps and begins and sleeps[0][0] < begins[0]:
-        sleeps = sleeps[1:]
-    return [(begin, *sleep) for begin, sleep in zip(begins, sleeps, strict=False)]
+    """When instances began and ended, and until when the thread slept then (ns).
+
+    Each lasts for some time. When timers have ended, the thread also sleeps again and again without
+    an instance in between.
+    """
+    begins = of_node(recording, "thread_wake", node)["time"]
+    sleeps = of_node(recording, "thread_sleep", node).select("time", "until")
+    places = sleeps["time"].search_sorted(begins, side="right")
+    ended = [(begin, place) for begin, place in zip(begins, places, strict=True)]
+    return [(begin, *sleeps.row(place)) for begin, place in ended if place < sleeps.height]
 
 
 def used(recording: Recording, node: str = "seen") -> dict[int, int]:

@@ -31,6 +31,7 @@ class _Node:
         self.waiting: dict[str, deque[int]] = {topic: deque() for topic in reads}
         self.snapshot: deque[str] = deque()
         self.stored: dict[str, int] = {}
+        self.has_news = False
         self.busy = False
 
 
@@ -102,11 +103,20 @@ class _Simulation:
 
     def store(self, node: _Node, topic: str, now: int) -> None:
         node.stored[topic] = node.waiting[topic].popleft()
+        node.has_news = True
         self.look(node, now)
 
     def instance(self, name: str, loop: CallbackDescription, due: int) -> Callable[[int], None]:
         def begin(now: int) -> None:
-            stamp = self.nodes[name].stored.get(loop.reads[0], now)
+            node = self.nodes[name]
+            if due > self.timing.last_timer_ns and not node.has_news:
+                following = due + (loop.loop_ns or 0)
+                while following < now:
+                    following += loop.loop_ns or 0
+                self.plan(following + self.wake_up, self.instance(name, loop, following))
+                return
+            node.has_news = False
+            stamp = node.stored.get(loop.reads[0], now)
             published = now + self.execution(name, loop)
             end, until = published + self.publish, due + (loop.loop_ns or 0)
             while until < end:

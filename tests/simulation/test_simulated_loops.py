@@ -135,8 +135,7 @@ def test_the_stamp_is_that_of_the_first_topic_that_it_reads(tmp_path: Path) -> N
     text = CHAIN.replace("reads: [/scan], LOOP", "reads: [/late, /scan], LOOP")
     text = text.replace("LOOP", "execution: {constant: 1ms}")
     text += "  late: {core: 5, callbacks: [{timer: 20ms, phase: 4ms, publishes: [/late]}]}\n"
-    recording = simulated(tmp_path, application(text))
-    stamps = uses(recording)
+    stamps = uses(simulated(tmp_path, application(text), cycles=2))
     assert stamps[:3] == [(6, 4), (14, 4), (22, 4)]
 
 
@@ -159,6 +158,17 @@ def test_a_loop_that_reads_nothing_ends_with_the_timers(tmp_path: Path) -> None:
     timing = timing_of(described, 3, START_NS)
     begins = recording.events["thread_wake"]["time"]
     assert begins.to_list() == [timing.anchor_ns + 20 * MS * number for number in (5, 6, 7)]
+
+
+def test_when_timers_have_ended_only_what_is_new_is_used(tmp_path: Path) -> None:
+    """The last scan, of 20 ms, arrives at 53 ms: the loop's last instance is that of 61."""
+    recording = simulated(tmp_path, chain(delivery={"constant": "33ms"}), cycles=2)
+    assert [begin for begin, _, _ in (in_ms(recording, *each) for each in awake(recording))] == [
+        *(5, 13, 21, 29, 37, 61),
+    ]
+    # The thread wakes up all the same: its last sleep is what the instance was due by.
+    slept = of_node(recording, "thread_sleep", "controller")["until"]
+    assert in_ms(recording, *slept.filter(slept <= begin_of(recording) + 61 * MS))[-1] == 61
 
 
 def test_the_first_instance_that_used_a_message_is_the_reaction_to_it() -> None:

@@ -22,6 +22,7 @@ from chainshaper.workload.description import (
     CallbackDescription,
     ExecutionTime,
     TopicDescription,
+    origin_timer,
 )
 from chainshaper.workload.execution import FIRST_AFTER, blocks
 from chainshaper.workload.timing import Timing
@@ -336,11 +337,11 @@ class Machine:
     def _loop(self, entity: Entity) -> _core.LoopDescription:
         process, reads = self._system.processes[entity.process], entity.described.reads
         threads = [(info.pid, info.role) for info in self._system.threads]
+        starts_chain = origin_timer(self._system.application)[1] is entity.described
         return _core.LoopDescription(
             thread=threads.index((process.pid, "loop")),
             inputs=len(reads),
-            # What still arrives when timers have ended is used.
-            last_ns=self._timing.stop_ns if reads else self._timing.last_timer_ns,
+            last_ns=self._timing.last_timer_ns if starts_chain else self._timing.stop_ns,
             ends_chain=self._system.chain.topics[-1:] == (process.node + LOOP_END,),
         )
 

@@ -311,6 +311,7 @@ def _setup_of(application: Application, name: str, domain: int, realtime: bool) 
         discovery_ns=DISCOVERY_NS,
         seed=application.seed,
         parent=os.getpid(),
+        starts_chain=origin_timer(application)[0] == name,
         origin_phase_ns=origin_timer(application)[1].phase_ns,
         delivery_core=dds.core if realtime and dds.core != executor.core else None,
     )

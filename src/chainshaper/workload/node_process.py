@@ -82,7 +82,9 @@ class NodeProcess:
             self.loop = Loop(callback.loop_ns, callback.phase_ns, len(topics), body, self.log)
             self.log.loop(self.setup.name)
             for number, topic in enumerate(topics):
-                self._store(symbol, topic, self.loop.stored, number, group)
+                handle = self.log.callback(symbol)
+                store = traced_callback(self.log, handle, partial(self.loop.store, number))
+                self._subscribe(handle, topic, store, group)
             return
         if callback.synchronises:
             self._add_synchroniser(symbol, callback, partial(_body, work, publishers, rest))
@@ -120,22 +122,6 @@ class NodeProcess:
             handle = self.log.callback(f"message_filters::{symbol}.{number}")
             body = traced_callback(self.log, handle, body_of(partial(synchroniser.add, number)))
             self._subscribe(handle, topic, body, self.setup.node.exclusive_group(callback))
-
-    def _store(
-        self,
-        symbol: str,
-        topic: str,
-        stored: list[dds.Message | None],
-        number: int,
-        group: str | None,
-    ) -> None:
-        """Have the executor store the newest message of a topic for the node's loop."""
-
-        def store(message: dds.Message) -> None:
-            stored[number] = message
-
-        handle = self.log.callback(symbol)
-        self._subscribe(handle, topic, traced_callback(self.log, handle, store), group)
 
     def _work(
         self, index: int, callback: CallbackDescription, publishers: Sequence[TracedPublisher]
@@ -290,8 +276,9 @@ class NodeProcess:
             for from_ns, by_ns in gate.moved(start_ns):
                 shaper.queue.move_slots(by_ns, from_ns)
         scheduling.stop_garbage_collection()
-        if self.loop is not None:  # what still arrives when timers have ended is used
-            self.loop.begin(start_ns, stop_ns if self.loop.stored else last_timer_ns)
+        if self.loop is not None:
+            last_ns = last_timer_ns if self.setup.starts_chain else stop_ns
+            self.loop.begin(start_ns, last_timer_ns, last_ns)
         self.executor.spin_until(stop_ns, last_timer_ns)
         if self.loop is not None:
             self.loop.over = True
