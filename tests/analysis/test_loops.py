@@ -32,6 +32,21 @@ def test_a_turn_is_what_lies_between_two_sleeps() -> None:
     ]
 
 
+def test_what_is_published_before_the_first_sleep_is_followed_from_its_publication() -> None:
+    """A thread's sleeps are recorded from its first publication on."""
+    story = Story()
+    node = story.node("/actor", PID)
+    cmd = story.publisher(node, "/cmd")
+    drives, out = story.relay("/drive", 30, "/cmd", "/out")
+    story.event("thread_wake", 20, PID, LOOP, call=0)
+    story.publish(cmd, 21, LOOP)
+    first_sleep(story, 40, 99)
+    turn(story, 100, 150, 199, writes=((cmd, 130),))
+    for sent in (21, 130):
+        story.runs(drives, sent + 5, sent + 9, reads=sent, writes=((out, sent + 8),))
+    assert latencies(story, "/cmd../out") == [(21, 29), (100, 138)]
+
+
 def test_a_turn_whose_sleep_was_lost_has_no_end() -> None:
     story = Story()
     first_sleep(story, 40, 99)

@@ -77,8 +77,11 @@ def test_an_actions_feedback_and_result_are_followed(recording: Path) -> None:
     assert len(found) > 30
     asked, worked = ((folder / name).read_text() for name in ("asker", "worker"))
     for place, truth in enumerate((printed(worked, "feedback"), printed(asked, "progress"))):
-        assert (truth[: len(found), 0] <= found[:, place]).all()
         assert (found[:-1, place] <= truth[1 : len(found), 0]).all()
+        if place:
+            assert (truth[: len(found), 0] <= found[:, place]).all()
+        else:  # a loop of the goal's thread, which begins as it wakes up
+            assert (truth[: len(found) - 1, 0] <= found[1:, place]).all()
     for spec, parts in (
         ("/asker../errand/_action/send_goal../errand/_action/feedback../progress", 1),
         ("/asker../errand/_action/get_result../finished", 3),

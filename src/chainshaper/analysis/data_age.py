@@ -148,4 +148,4 @@ def _uses(cycles: pl.DataFrame, messages: pl.DataFrame) -> tuple[dict[str, int],
         "never": int((uses == 0).sum()),
         "once": int((uses == 1).sum()),
         "again": int((uses > 1).sum()),
-    }, int(uses.max() or 0)  # type: ignore[arg-type]
+    }, int(uses.max() or 0)

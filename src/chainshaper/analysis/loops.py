@@ -133,6 +133,7 @@ def with_loops(
         notes += _notes(loop, of_loop)
         instances = pl.concat([instances, _as_instances(callback_id, of_loop)], how="diagonal")
         published = _given(published, outside, loop, of_loop, callback_id)
+        instances, published = _with_first_publications(instances, published, loop, callback_id)
         if loop.named:
             published = _with_ends(published, objects, loop, of_loop, callback_id)
         overran = (pl.col("left_ns") <= 0).fill_null(False) | _overlong(of_loop)
@@ -165,8 +166,8 @@ def _outside(placed: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
     """
     assumed = pl.lit(instances["assumed"]).gather("instance").fill_null(False)
     placed = placed.with_columns(assumed=assumed)
-    repeated = placed.filter("assumed").group_by("instance", "publisher")
-    repeated = repeated.agg(turns=pl.col("turn").n_unique()).filter(pl.col("turns") > 1)
+    by_callback = placed.filter("assumed").group_by("instance", "publisher")
+    repeated = by_callback.agg(turns=pl.col("turn").n_unique()).filter(pl.col("turns") > 1)
     by_loop = pl.col("assumed") & pl.col("publisher").is_in(repeated["publisher"].implode())
     internal = pl.col("topic").cast(pl.String).is_in(sorted(INTERNAL_TOPICS))
     outside = (pl.col("instance").is_null() | by_loop) & ~internal & pl.col("node").is_not_null()
@@ -319,6 +320,28 @@ def _given(
         pl.coalesce(by_number(wrote, "publication", column, published.height), column)
         for column in ("instance", "callback_id")
     )
+
+
+def _with_first_publications(
+    instances: pl.DataFrame, published: pl.DataFrame, loop: _Loop, callback_id: int
+) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Add an assumed instance for each publication of a loop that lies in no turn.
+
+    As the one before its thread's first sleep, from which on its sleeps are recorded.
+    """
+    of_loop = pl.col("topic").is_in(loop.topics) & (pl.col("pid") == loop.pid)
+    left = published.filter(of_loop, pl.col("instance").is_null(), node=loop.node)
+    left = left.drop("instance", "callback_id").with_row_index("instance", instances.height)
+    left = left.with_columns(callback_id=pl.lit(callback_id, pl.UInt32))
+    columns = ("instance", "callback_id")
+    added = left.select(
+        *columns, *_THREAD, start="time", intra_process=pl.lit(False), assumed=pl.lit(True)
+    )
+    published = published.with_columns(
+        pl.coalesce(column, by_number(left, "publication", column, published.height))
+        for column in columns
+    )
+    return pl.concat([instances, added], how="diagonal"), published
 
 
 def _with_ends(

@@ -146,7 +146,8 @@ def traverse(flow: DataFlow, chain: Chain, graph: ApplicationGraph | None = None
         standby = _standby(graph, callback, topic)
         if hop:
             state = _take(flow, state, hop, callback, standby=standby, topic=topic)
-        state = _publish(flow, state, hop, [callback.id, *standby], topic)
+        state, repeats = _publish(flow, state, hop, [callback.id, *standby], topic)
+        notes += repeats
         if topic in callback.passes_on or (hop and goes_on_elsewhere(graph, callback, topic)):
             reading = readers(graph, callback, topic)
             state, note = _publish_by_sibling(flow, state, hop, callback, topic, reading=reading)
@@ -198,14 +199,22 @@ def _standby(graph: ApplicationGraph, callback: Callback, topic: str) -> list[in
 
 def _publish(
     flow: DataFlow, state: pl.DataFrame, hop: int, callbacks: Sequence[int], topic: str
-) -> pl.DataFrame:
-    """Add the publications of the hop's topic inside each traversal's instance."""
+) -> tuple[pl.DataFrame, list[str]]:
+    """Add the publications of the hop's topic inside each traversal's instance.
+
+    The notes say how many were left out that only look as if they were inside it.
+    """
     for_hop = pl.col("callback_id").is_in(callbacks) & (pl.col("topic") == topic)
     published = flow.publications.lazy().filter(for_hop & pl.col("instance").is_not_null())
     inside = published.select("instance", "publication").collect()
     endless = pl.lit(flow.instances["assumed"] & flow.instances["end"].is_null())
     again = pl.col("instance").is_duplicated() & ~pl.col("instance").is_first_distinct()
-    inside = inside.filter(~(endless.gather("instance") & again))
+    first_alone = inside.filter(~(endless.gather("instance") & again))
+    repeats, inside = inside.height - first_alone.height, first_alone
+    notes = [
+        f"{repeats} messages on {topic} were published behind the first one after a take, without"
+        " callback events (Python): they count as repeats of older data, not as cycles."
+    ]
     instance, publication = f"instance_{hop}", f"publication_{hop}"
     first = by_number(inside, "instance", "publication", flow.instances.height)
     if first.count() == inside.height:
@@ -213,7 +222,8 @@ def _publish(
     else:  # an instance that publishes several times begins as many traversals
         numbers = inside.select(**{instance: "instance", publication: "publication"})
         state = state.join(numbers, on=instance, how="left", maintain_order="left")
-    return state.with_columns(pl.lit(False).alias(f"sibling_{hop}"))
+    state = state.with_columns(pl.lit(False).alias(f"sibling_{hop}"))
+    return state, notes if repeats else []
 
 
 def _publish_by_sibling(

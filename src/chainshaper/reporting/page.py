@@ -213,7 +213,7 @@ def _data_age(analysis: LatencyAnalysis) -> str:
     if analysis.data_age is None:
         return ""
     table = of_chain.data_age_table(analysis.data_age)
-    return _paragraph(f"{table.title}:") + table.html() + _paragraph(table.caption)
+    return _paragraph(f"{table.title}:") + table.html() + _paragraph(table.caption or "")
 
 
 def _tables(parts: Sequence[_NamedMeasurement], suffix: str, several: bool) -> dict[str, str]:

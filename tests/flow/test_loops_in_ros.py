@@ -1,0 +1,114 @@
+"""Loops that are no callbacks, on real ROS 2: what they really used, turn by turn, is what we say.
+
+The nodes of `looping.cpp` and `looping.py` note for each turn which message they used.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from ros2 import ros2_environment
+
+from chainshaper.analysis import analyse_latency
+from chainshaper.values.recording import open_recording
+
+HERE = Path(__file__).parent
+pytestmark = [pytest.mark.ros2, pytest.mark.timed, pytest.mark.timeout(600)]
+SENSOR_MS, LOOP_MS = 20, 10
+STORED_WHILE_READ_NS = 300_000
+"""A message that comes so soon behind the start of a turn may be read in it, or not."""
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("looping")
+    for step in (["-S", HERE, "-B", folder], ["--build", folder, "--target", "looping"]):
+        words = ["env", "cmake", *map(str, step)]
+        run = subprocess.run(
+            words, env=ros2_environment(), capture_output=True, text=True, check=False
+        )
+        assert run.returncode == 0, run.stdout + run.stderr
+    return folder / "looping"
+
+
+def recorded(folder: Path, sensor: str, loop: str, *options: str) -> Path:
+    script = f"trap 'kill $(jobs -p)' INT TERM\n{sensor} &\n{loop} &\nwait; wait"
+    command = [sys.executable, "-m", "chainshaper", "record", "-o", str(folder / "recording")]
+    run = subprocess.run(
+        [*command, *options, "--duration", "10s", "--json", "--", "bash", "-c", script],
+        env={**ros2_environment(), "ROS_DOMAIN_ID": str(100 + os.getpid() % 100)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr[-3000:]
+    return folder / "recording"
+
+
+def noted(file: Path) -> npt.NDArray[np.int64]:
+    """The origin that each turn used, and the instants before it published and behind that."""
+    lines = file.read_text().splitlines()
+    return np.array([[int(word) for word in line.split()] for line in lines[:-1]], np.int64)
+
+
+def assert_as_noted(recording: Path, notes: Path, chain: str) -> None:
+    """Each cycle of the loop used the message that it noted."""
+    analysis = analyse_latency(open_recording(recording), chain)
+    assert analysis.data_age is not None
+    cycles = analysis.data_age.cycles.drop_nulls("traversal")
+    starts = analysis.traversals.sort("traversal")["start"].to_numpy()
+    turns = noted(notes)
+    place = np.searchsorted(turns[:, 1], cycles["publish"].to_numpy(), side="right") - 1
+    known = (place >= 0) & (place < len(turns) - 1)
+    assert known.sum() > 500
+    used = turns[place[known], 0]
+    expected = np.searchsorted(starts, used, side="right") - 1
+    traversal = cycles["traversal"].to_numpy()[known]
+    wrong = np.flatnonzero(traversal != expected)
+    hop = analysis.hops.filter(hop=1).sort("start")["start"].to_numpy()
+    began = cycles["start"].to_numpy()[known][wrong]
+    since = began - hop[np.searchsorted(hop, began + STORED_WHILE_READ_NS) - 1]
+    assert (np.abs(since) <= STORED_WHILE_READ_NS).all(), (len(wrong), len(used))
+    assert len(wrong) <= 0.02 * len(used)
+    # The first use of a message is its cycle: there are no more cycles than messages.
+    outputs = analysis.traversals.filter("complete")
+    assert outputs["traversal"].n_unique() == outputs.height
+    assert outputs["publication"].n_unique() == outputs.height
+
+
+@pytest.mark.ros2("rclcpp")
+@pytest.mark.parametrize("kind", ["thread", "spin_some"])
+def test_a_loop_in_cpp(program: Path, tmp_path: Path, kind: str) -> None:
+    notes = tmp_path / "notes"
+    sensor = f'"{program}" /dev/null sensor {SENSOR_MS}'
+    recording = recorded(tmp_path, sensor, f'"{program}" "{notes}" {kind} {LOOP_MS}')
+    assert_as_noted(recording, notes, "/scan../command")
+    words = ["callbacks", str(recording), "--json"]
+    shown = subprocess.run(
+        [sys.executable, "-m", "chainshaper", *words], capture_output=True, text=True, check=True
+    )
+    (loop,) = (row for row in json.loads(shown.stdout) if row["kind"] == "loop")
+    assert abs(loop["period_ns"] - LOOP_MS * 1_000_000) < 100_000
+    assert loop["execution_ns"]["mean"] > 900_000, "it computes for 1 ms"
+
+
+@pytest.mark.ros2("rclcpp")
+def test_a_loop_that_publishes_nothing_is_named(program: Path, tmp_path: Path) -> None:
+    notes = tmp_path / "notes"
+    sensor = f'"{program}" /dev/null sensor {SENSOR_MS}'
+    silent = f'"{program}" "{notes}" silent {LOOP_MS}'
+    recording = recorded(tmp_path, sensor, silent, "--loop", "/actor")
+    assert_as_noted(recording, notes, "/scan../actor:end")
+
+
+@pytest.mark.ros2("rclcpp")
+def test_a_loop_in_python_that_is_faster_than_its_input(program: Path, tmp_path: Path) -> None:
+    notes = tmp_path / "notes"
+    sensor = f'"{program}" /dev/null sensor {SENSOR_MS}'
+    loop = f'python3 "{HERE / "looping.py"}" "{notes}" {LOOP_MS / 2}'
+    assert_as_noted(recorded(tmp_path, sensor, loop), notes, "/scan../command")
