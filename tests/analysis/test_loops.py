@@ -148,6 +148,19 @@ def test_a_python_loop_that_is_faster_than_its_input_has_a_cycle_for_each_messag
     assert latencies(python_loop(sleeps=sleeps), "/a../cmd") == expected
 
 
+def test_the_first_message_that_a_python_loop_takes_is_not_its_callbacks_either() -> None:
+    """It is taken and passed on before the thread first sleeps."""
+    story = python_loop(sleeps=True)
+    first = min(row["time"] for row in story.rows["thread_sleep"])
+    for name in ("thread_sleep", "thread_wake"):
+        story.rows[name] = [row for row in story.rows[name] if row["time"] > first + 100]
+    graph = graph_of(data_flow(story.tables()))
+    (reader,) = (c for c in graph.callbacks if c.topic == "/a")
+    assert reader.passes_on == ("/cmd",)
+    expected = [(woke - 50, woke + 10) for woke in range(100, 900, 200)]
+    assert latencies(story, "/a../cmd") == expected
+
+
 def ages(story: Story, chain: str) -> list[tuple[int, int | None, int | None, int | None]]:
     """Start of each cycle of the loop; the data's age there and at the end; which use it is."""
     age = analyse_latency(data_flow(story.tables()), chain).data_age
@@ -246,6 +259,17 @@ def test_a_loop_that_is_woken_before_its_time_is_paced_by_data() -> None:
     assert flow.objects.callbacks["kind"].to_list() == ["unknown"]
     (note,) = flow.notes
     assert "/driver publishes /points" in note and str(LOOP) in note and "paced by data" in note
+
+
+def test_a_sleep_that_ends_a_little_early_is_one_for_a_time() -> None:
+    """By 2 of 100, as where the middleware waits by another clock."""
+    story = Story()
+    node = story.node("/actor", PID)
+    out = story.publisher(node, "/cmd")
+    first_sleep(story, 0, 102)
+    for woke in range(100, 600, 100):
+        turn(story, woke, woke + 2, woke + 102, writes=((out, woke + 1),))
+    assert row(story)["period_ns"] == 100
 
 
 def test_a_loop_that_never_sleeps_for_a_time_is_paced_by_data() -> None:

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +23,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from processes import wait_for
 
+from chainshaper.enforcement.node_threads import Allocation
 from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow import phase
 from chainshaper.flow.phase import (
@@ -35,6 +37,9 @@ from chainshaper.flow.phase import (
 )
 from chainshaper.flow.plan_in_force import phases, supervision, threads
 from chainshaper.planning import ChainPlan
+from chainshaper.planning.chain_plan import shaping_nodes
+from chainshaper.planning.shaping import plan_shaping
+from chainshaper.sources import ros
 from chainshaper.sources.ros import Script
 from chainshaper.values.errors import OperationError
 
@@ -328,3 +333,35 @@ def test_a_node_that_never_answers_is_given_up(monkeypatch: pytest.MonkeyPatch) 
     (note,) = Telling(("/shaper",), None, 0.0, "python3 cannot be started").end()
     assert "/shaper did not get where cycles begin (python3 cannot be started)" in note
     assert NO_NODE.end() == ()
+
+
+@pytest.mark.parametrize("has_page", [True, False])
+def test_a_shaping_node_is_asked_on_its_page_and_by_ros_where_it_has_none(
+    monkeypatch: pytest.MonkeyPatch, has_page: bool
+) -> None:
+    """A process that joins the robot's graph may hold up what others publish with Fast DDS."""
+    plan = plan_shaping(np.array([20 * MS, 21 * MS]), CYCLE, nodes=("/last",), output="/out")
+    asked: list[object] = []
+
+    def ask(topic: str, pids: set[int], phase_ns: int) -> None:
+        if not has_page:
+            raise OperationError("no gates publish it now")
+        asked.append((topic, pids, phase_ns))
+
+    def start(_environment: object, _script: str, *arguments: str) -> Script:
+        asked.append(arguments)
+        return telling("true").script  # type: ignore[return-value]
+
+    monkeypatch.setattr(phase, "ask_phase", ask)
+    monkeypatch.setattr(ros, "start_with_rclpy", start)
+    in_ros = ros.Environment({phase._HAS_ROS: "/opt/ros/jazzy"}, os.getuid())
+    monkeypatch.setattr(ros, "environment_of", lambda _: in_ros)
+    thread = SimpleNamespace(nodes=("/chainshaper_out",), thread=SimpleNamespace(pid=7))
+    allocation = Allocation(threads=(thread,), notes=())  # type: ignore[arg-type]
+    told = phase.tell_phase(shaping_nodes(plan), allocation, 5 * MS)
+    if has_page:
+        assert asked == [("/out", {7}, 5 * MS)]
+        assert told == NO_NODE
+    else:
+        assert asked == [("parameter", "phase_ns", str(5 * MS), "/chainshaper_out")]
+        told.end()

@@ -612,31 +612,7 @@ def _with_assumed_writers(
         observed=pl.lit(False),
     )
     callbacks = pl.concat([objects.callbacks, new], how="diagonal_relaxed").cast(CALLBACK_SCHEMA)  # type: ignore[arg-type]
-    regular = (
-        "regularly from a thread of its own, which counts as a loop. No event shows its sleep"
-        " (`record --source preload` sees it): each of its instances is known by its publication"
-        " alone, so its response time, its overruns, and what it read while it computed are not"
-        " known"
-    )
-    other = (
-        "outside its callbacks (from a thread of its own, from Python, or from a service client's"
-        " callback): a chain that begins there is measured from the publication"
-    )
-    followed = outside_publications.join(
-        events.table(tables, "thread_wake").select("pid", "tid").unique(), on=["pid", "tid"]
-    )
-    threads = dict(followed.group_by("callback_id").agg(pl.col("tid").first()).iter_rows())
-    notes = []
-    for node, topic, number in outside.select("node", "topic", "callback_id").iter_rows():
-        text = regular if number in periods else other
-        if number in threads:
-            text = (
-                f"from a thread of its own (thread {threads[number]}) that does not sleep for a"
-                " time, or mostly wakes up before it is over: it is paced by data or by another"
-                " thread, and has no period of its own. A chain that begins there is measured from"
-                " the publication"
-            )
-        notes.append(f"{node} publishes {topic} {text}.")
+    notes = _notes_of_writers(outside, outside_publications, periods, tables)
     objects = replace(objects, callbacks=callbacks, notes=(*objects.notes, *notes))
     all_instances = pl.concat([instances, assumed_instances], how="diagonal").select(
         instances.columns
@@ -663,3 +639,40 @@ def _periods_of_writers(
         if rows["tid"].n_unique() == 1 and seems_regular(times):
             periods[int(str(number))] = regular_period(times) or 0
     return periods
+
+
+def _notes_of_writers(
+    writers: pl.DataFrame,
+    written: pl.DataFrame,
+    periods: Collection[int],
+    tables: events.EventTables,
+) -> Iterator[str]:
+    """Say of topics that are published only outside callbacks what is known of who does it.
+
+    ``writers`` has their callbacks, ``written`` the publications; ``periods`` are those that count
+    as loops.
+    """
+    sleeping = events.table(tables, "thread_wake").select("pid", "tid").unique()
+    followed = written.join(sleeping, on=["pid", "tid"]).group_by("callback_id")
+    threads = dict(followed.agg(pl.col("tid").first()).iter_rows())
+    for node, topic, number in writers.select("node", "topic", "callback_id").iter_rows():
+        if number in periods:
+            text = (
+                "regularly from a thread of its own, which counts as a loop. No event shows its"
+                " sleep (`record --source preload` sees it): each of its instances is known by its"
+                " publication alone, so its response time, its overruns, and what it read while it"
+                " computed are not known"
+            )
+        elif number in threads:
+            text = (
+                f"from a thread of its own (thread {threads[number]}) that does not sleep for a"
+                " time, or mostly wakes up before it is over: it is paced by data or by another"
+                " thread, and has no period of its own. A chain that begins there is measured from"
+                " the publication"
+            )
+        else:
+            text = (
+                "outside its callbacks (from a thread of its own, from Python, or from a service"
+                " client's callback): a chain that begins there is measured from the publication"
+            )
+        yield f"{node} publishes {topic} {text}."

@@ -38,6 +38,7 @@ from chainshaper.values.event_declarations import SLEEPING_CALLS
 
 _THREAD = ["pid", "tid"]
 _TIMED_SHARE = 0.5  # of a loop's turns: so many must begin when the time to sleep was over
+_EARLY = 0.05  # share of a sleep by which it may end early: not every middleware's clock is ours
 _FOR_A_TIME = [SLEEPING_CALLS.index(name) for name in ("clock_nanosleep", "nanosleep", "timerfd")]
 """Calls by which a thread can only sleep, not wait for something."""
 
@@ -81,6 +82,7 @@ def thread_turns(tables: events.EventTables) -> pl.DataFrame:
     * ``start``, ``end``: when the thread woke up, and went to sleep again (ns; ``end`` is null
       where it did not, or the event was lost).
     * ``due``: until when it had wanted to sleep (ns; null: not known).
+    * ``wanted_ns``: for how long it had wanted to sleep.
     * ``left_ns``: how long it wanted to sleep behind ``end``; 0 or less: the time was over already.
     * ``call``: by which function it had slept, a place in SLEEPING_CALLS.
     * ``execution_ns``: its CPU time between the two.
@@ -103,6 +105,7 @@ def thread_turns(tables: events.EventTables) -> pl.DataFrame:
         start="time",
         end=beside("time", -1),
         due=beside("until", 1),
+        wanted_ns=beside("until", 1) - beside("time", 1),
         left_ns=beside("until", -1) - beside("time", -1),
         execution_ns=beside("thread_time", -1) - pl.col("thread_time"),
     )
@@ -120,8 +123,8 @@ def with_loops(
     turns = thread_turns(tables)
     if turns.is_empty():
         return FlowWithLoops(objects, instances, published, NO_TURNS)
-    placed = _placed(published, turns)
-    outside = _outside(placed, instances)
+    published = _without_repeats(published, turns, instances)
+    outside = _outside(published, turns)
     loops, notes = _loops(outside, turns, tables, objects)
     last: int | None = objects.callbacks.select(pl.col("callback_id").max()).item()
     number = 0 if last is None else last + 1
@@ -158,20 +161,40 @@ def _placed(published: pl.DataFrame, turns: pl.DataFrame) -> pl.DataFrame:
     return rows.filter(pl.col("turn").is_not_null() & is_inside).drop("start", "over")
 
 
-def _outside(placed: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
-    """Select the publications in turns that no callback made.
+def _without_repeats(
+    published: pl.DataFrame, turns: pl.DataFrame, instances: pl.DataFrame
+) -> pl.DataFrame:
+    """Take what a loop publishes again out of the assumed instances of callbacks (Python).
 
-    That an assumed instance (of Python) publishes the same topic in several turns shows that a loop
-    publishes it, in all turns.
+    That such an instance publishes the same topic in several turns shows that a loop does it, if
+    the thread sleeps for a time in between. Then none of the publisher's messages are the
+    callback's.
     """
     assumed = pl.lit(instances["assumed"]).gather("instance").fill_null(False)
-    placed = placed.with_columns(assumed=assumed)
-    by_callback = placed.filter("assumed").group_by("instance", "publisher")
-    repeated = by_callback.agg(turns=pl.col("turn").n_unique()).filter(pl.col("turns") > 1)
-    by_loop = pl.col("assumed") & pl.col("publisher").is_in(repeated["publisher"].implode())
+    placed = _placed(published, turns).filter(assumed)
+    in_turns = placed.group_by("instance", "publisher").agg(count=pl.col("turn").n_unique())
+    of_loops = [
+        publisher
+        for publisher in in_turns.filter(pl.col("count") > 1)["publisher"].unique().sort()
+        if _timed_share(_turns_in(turns, placed.filter(publisher=publisher))) >= _TIMED_SHARE
+    ]
+    by_loop = pl.col("publisher").is_in(of_loops) & assumed
+    columns = ("instance", "callback_id")
+    return published.with_columns(
+        pl.when(~by_loop).then(column).alias(column) for column in columns
+    )
+
+
+def _outside(published: pl.DataFrame, turns: pl.DataFrame) -> pl.DataFrame:
+    """Select the publications in turns that no callback made, with the number of their turn."""
     internal = pl.col("topic").cast(pl.String).is_in(sorted(INTERNAL_TOPICS))
-    outside = (pl.col("instance").is_null() | by_loop) & ~internal & pl.col("node").is_not_null()
-    return placed.filter(outside).drop("assumed")
+    outside = pl.col("instance").is_null() & ~internal & pl.col("node").is_not_null()
+    return _placed(published.filter(outside), turns)
+
+
+def _turns_in(turns: pl.DataFrame, placed: pl.DataFrame) -> pl.DataFrame:
+    """Select the turns in which publications lie."""
+    return turns.filter(pl.col("turn").is_in(placed["turn"].implode()))
 
 
 def _loops(
@@ -183,8 +206,7 @@ def _loops(
     for pid, node, topics in _published_together(outside, taken_over):
         written = outside.filter(pl.col("topic").is_in(topics), pid=pid, node=node)
         tids = tuple(written["tid"].unique().sort())
-        of_topics = turns.filter(pl.col("turn").is_in(written["turn"].implode()))
-        if _timed_share(of_topics) >= _TIMED_SHARE:
+        if _timed_share(_turns_in(turns, written)) >= _TIMED_SHARE:
             loops.append(_Loop(pid, node, topics, tids))
     for tid, together in _of_thread(loops).items():
         if len(together) > 1:
@@ -249,7 +271,9 @@ def _published_together(
 def _timed_share(turns: pl.DataFrame) -> float:
     """Return the share of turns that began when the time to sleep was over, not before."""
     timer = SLEEPING_CALLS.index("timerfd")  # it says no time, but cannot be woken earlier
-    is_timed = (pl.col("start") >= pl.col("due")).fill_null(pl.col("call") == timer)
+    early = (pl.col("due") - pl.col("start")).clip(lower_bound=0)
+    is_timed = (early <= _EARLY * pl.col("wanted_ns")) | (early == 0)
+    is_timed = is_timed.fill_null(pl.col("call") == timer)
     return float(turns.select(is_timed.mean()).item() or 0.0)
 
 
@@ -276,7 +300,7 @@ def _turns_of(
     if len(shared) == 1 or loop.named:
         return chosen
     wrote = outside.filter(pl.col("topic").is_in(loop.topics), pid=loop.pid, node=loop.node)
-    return chosen.filter(pl.col("turn").is_in(wrote["turn"].implode()))
+    return _turns_in(chosen, wrote)
 
 
 def _callback(callback_id: int, loop: _Loop, turns: pl.DataFrame) -> pl.DataFrame:
@@ -363,9 +387,11 @@ def _overlong(turns: pl.DataFrame) -> pl.Expr:
 
     A rate loop that is late does not sleep at all: two of its iterations lie in one turn.
     """
-    usual = turns["start"].sort().diff().median()
+    starts = turns["start"].sort().to_numpy()
+    if not _is_regular(starts):
+        return pl.lit(False)
     lasts = pl.col("end") - pl.col("start")
-    return (lasts >= pl.lit(usual)).fill_null(False) if usual is not None else pl.lit(False)
+    return (lasts >= float(np.median(np.diff(starts)))).fill_null(False)
 
 
 def _is_regular(starts: npt.NDArray[np.int64]) -> bool:

@@ -207,14 +207,17 @@ def _publish(
     for_hop = pl.col("callback_id").is_in(callbacks) & (pl.col("topic") == topic)
     published = flow.publications.lazy().filter(for_hop & pl.col("instance").is_not_null())
     inside = published.select("instance", "publication").collect()
-    endless = pl.lit(flow.instances["assumed"] & flow.instances["end"].is_null())
-    again = pl.col("instance").is_duplicated() & ~pl.col("instance").is_first_distinct()
-    first_alone = inside.filter(~(endless.gather("instance") & again))
-    repeats, inside = inside.height - first_alone.height, first_alone
-    notes = [
-        f"{repeats} messages on {topic} were published behind the first one after a take, without"
-        " callback events (Python): they count as repeats of older data, not as cycles."
-    ]
+    endless, notes = flow.instances["assumed"] & flow.instances["end"].is_null(), list[str]()
+    if endless.any():
+        is_first = pl.col("instance").is_first_distinct()
+        first_alone = inside.filter(is_first | ~pl.lit(endless).gather("instance"))
+        if repeats := inside.height - first_alone.height:
+            notes.append(
+                f"{repeats} messages on {topic} were published behind the first one after a take,"
+                " without callback events (Python): they count as repeats of older data, not as"
+                " cycles."
+            )
+        inside = first_alone
     instance, publication = f"instance_{hop}", f"publication_{hop}"
     first = by_number(inside, "instance", "publication", flow.instances.height)
     if first.count() == inside.height:
@@ -223,7 +226,7 @@ def _publish(
         numbers = inside.select(**{instance: "instance", publication: "publication"})
         state = state.join(numbers, on=instance, how="left", maintain_order="left")
     state = state.with_columns(pl.lit(False).alias(f"sibling_{hop}"))
-    return state, notes if repeats else []
+    return state, notes
 
 
 def _publish_by_sibling(

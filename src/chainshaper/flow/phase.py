@@ -375,8 +375,29 @@ class Telling:
 NO_NODE = Telling((), None, 0.0)  # none is to get a phase
 
 
+def _is_asked(node: ShapingNode, pid: int, phase_ns: int) -> bool:
+    """Ask for a phase on the page of a gate; return whether there is one.
+
+    Raises OperationError: there is none of a gate in its publisher's process.
+    """
+    try:
+        ask_phase(node.output, {pid}, phase_ns)
+    except OperationError:
+        if node.in_process:
+            raise
+        return False
+    return True
+
+
 def tell_phase(nodes: Collection[ShapingNode], allocation: Allocation, phase_ns: int) -> Telling:
-    """Begin to give shaping nodes in ROS 2 where their chain begins in every cycle."""
+    """Give shaping nodes in ROS 2 where their chain begins in every cycle, or begin to.
+
+    It is asked for on the page of a gate that publishes. Only a shaping node whose page is not
+    known gets it as a parameter: another process has to join the robot's graph for that, and with
+    Fast DDS each publication of the robot may wait for a third of a second then, since whoever
+    opens a shared memory port looks at its health (upstream: Fast DDS, `SharedMemGlobal.hpp`,
+    `healthy_check`).
+    """
     names = [node.thread.node for node in nodes]
     pids = {
         name: listed.thread.pid
@@ -392,8 +413,8 @@ def tell_phase(nodes: Collection[ShapingNode], allocation: Allocation, phase_ns:
     running, environments = tuple(pids), dict[str, ros.Environment]()
     try:
         for node in nodes:
-            if node.in_process and node.thread.node in pids:
-                ask_phase(node.output, {pids.pop(node.thread.node)}, phase_ns)
+            if node.thread.node in pids and _is_asked(node, pids[node.thread.node], phase_ns):
+                pids.pop(node.thread.node)
         for name, pid in pids.items():
             try:
                 environment = ros.environment_of(pid)
