@@ -152,8 +152,8 @@ def test_before_anything_has_arrived_an_instance_stamps_its_message_itself(tmp_p
 
 
 def test_a_loop_that_reads_nothing_ends_with_the_timers(tmp_path: Path) -> None:
-    text = "{chain: a, nodes: {a: {callbacks: [{loop: 20ms, publishes: [/a]}]}}}"
-    described = application(text)
+    text = "{loop: 20ms, execution: {constant: 1ms}, publishes: [/a]}"
+    described = application(f"{{chain: a, nodes: {{a: {{callbacks: [{text}]}}}}}}")
     recording = simulate(described, tmp_path / "recording", cycles=3)
     timing = timing_of(described, 3, START_NS)
     begins = recording.events["thread_wake"]["time"]

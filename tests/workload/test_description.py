@@ -202,7 +202,13 @@ scheduling: {executors: {core: 1, priority: 80}, dds: {core: 0, priority: 90}}
 nodes:
   controller:
     callbacks:
-      - {loop: 10ms, phase: 2ms, core: 2, priority: 85, reads: [/state], publishes: [/command]}
+      - loop: 10ms
+        phase: 2ms
+        core: 2
+        priority: 85
+        reads: [/state]
+        execution: {constant: 1ms}
+        publishes: [/command]
   plant:
     callbacks:
       - {subscription: /command, publishes: [/state]}
@@ -223,7 +229,7 @@ def test_a_loop_has_its_own_core_and_may_close_a_circle_of_topics(tmp_path: Path
     assert application.cores()[2] == "the loop of node controller"
     (written,) = application_as_written(application)["nodes"]["controller"]["callbacks"]
     assert written["loop"] == "10ms"
-    path.write_text(LOOP.replace(", core: 2, priority: 85", ""))
+    path.write_text(LOOP.replace("        core: 2\n        priority: 85\n", ""))
     assert load_application(path).loop_scheduling_of("controller") == application.scheduling_of(
         "controller"
     )

@@ -61,7 +61,12 @@ nodes:
   lidar: {callbacks: [{timer: 20ms, publishes: [/scan]}]}
   controller:
     callbacks:
-      - {loop: 5ms, phase: 1ms, priority: 85, reads: [/scan], publishes: [/command]}
+      - loop: 5ms
+        phase: 1ms
+        priority: 85
+        reads: [/scan]
+        execution: {constant: 1ms}
+        publishes: [/command]
   arm: {callbacks: [{subscription: /command}]}
 """
 

@@ -337,6 +337,9 @@ class CallbackDescription(Part):
                     raise wrong_value(reason, key)
         elif self.computes is not None:
             raise wrong_value("a loop calls no function: describe its `execution`", "computes")
+        elif self.execution.constant_ns == 0:  # its waking up and its sleep would be one instant
+            reason = "an instance of a loop takes time: describe it, such as {constant: 500us}"
+            raise wrong_value(reason, "execution")
         if len(set(self.reads)) < len(self.reads):
             raise wrong_value("name each topic once", "reads")
 
