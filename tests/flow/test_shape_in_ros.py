@@ -294,7 +294,7 @@ def test_each_mode_has_the_slot_of_its_own_profile(
     assert plan.modes is not None
     assert plan.modes.bands == {"city": 1, "highway": 2}
     longest = {mode: one.max_latency_ns for mode, one in (plan.evidence.modes or {}).items()}
-    assert 9 * MS < longest["city"] < 15 * MS < longest["highway"] < 26 * MS
+    assert longest["city"] < 0.8 * longest["highway"], "each mode has latencies of its own"
     after = open_recording(folder / "after").events["gate_release"]
     assert {*after["mode"]} == {"city", "highway"}
     assert values["recordings"][1]["count"] > 100

@@ -24,7 +24,11 @@ from typing import Any
 
 WITHIN = "chainshaper_within"  # launch argument: seconds from the start until all nodes run
 WITHIN_S = 30.0
-DISCOVERY_S = 5.0  # for so long before that the launch listens for publishers and subscribers
+DISCOVERY_S = 5.0  # for so long before that, at least, it listens for publishers and subscribers
+# By then the user's launch files have set the environment. Later a node that joins the graph would
+# be in the way: with Fast DDS it may hold up every publication of the robot for a third of a
+# second, as whoever opens a shared memory port looks at its health (`SharedMemGlobal.hpp` there).
+LISTEN_S = 1.0
 MOST_LOOKS = 10  # looks for publishers, a second apart, while discovery has not named all nodes
 UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # of an endpoint that was discovered before its node was (rmw)
 
@@ -368,7 +372,7 @@ def _begin(context: Any, redirects: Sequence[Redirect]) -> list[Any] | None:
     begin = OpaqueFunction(function=listen)
     check = OpaqueFunction(function=_check, args=[redirects])
     return [
-        TimerAction(period=max(0.0, within_s - DISCOVERY_S), actions=[begin]),
+        TimerAction(period=min(LISTEN_S, max(0.0, within_s - DISCOVERY_S)), actions=[begin]),
         TimerAction(period=within_s, actions=[check]),
     ]
 
