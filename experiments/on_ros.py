@@ -76,7 +76,7 @@ class Shaping:
 
     def lasting_ns(self, cycles: int) -> int:
         """How long to record for so many cycles: nodes wait for each other before the first."""
-        return START_NS + cycles * (origin_timer(self.application)[1].timer_ns or 0)
+        return START_NS + cycles * (origin_timer(self.application)[1].period_ns or 0)
 
 
 def ros_runs(experiment: str, shapings: Sequence[Shaping], options: Options) -> list[Run]:

@@ -21,7 +21,8 @@ void bind_kinds(nb::module_ & module) {
   nb::enum_<Role>(module, "Role", "What a thread is for.")
       .value("executor", Role::executor)
       .value("publisher", Role::publisher)
-      .value("dds", Role::dds);
+      .value("dds", Role::dds)
+      .value("loop", Role::loop);
   nb::enum_<ExecutorKind>(module, "ExecutorKind", "In which order an executor runs callbacks.")
       .value("single_threaded", ExecutorKind::single_threaded)
       .value("static_single_threaded", ExecutorKind::static_single_threaded)
@@ -31,12 +32,14 @@ void bind_kinds(nb::module_ & module) {
       .value("timer", EntityKind::timer)
       .value("subscription", EntityKind::subscription)
       .value("service", EntityKind::service)
-      .value("client", EntityKind::client);
+      .value("client", EntityKind::client)
+      .value("loop", EntityKind::loop);
   nb::enum_<Body>(module, "Body", "What a callback does.")
       .value("compute", Body::compute)
       .value("gate", Body::gate)
       .value("mode_listener", Body::mode_listener)
-      .value("synchronise", Body::synchronise);
+      .value("synchronise", Body::synchronise)
+      .value("store", Body::store);
   nb::enum_<Pause>(module, "Pause", "Why `Simulation.run` has returned.")
       .value("none", Pause::none)
       .value("log_full", Pause::log_full)
@@ -93,6 +96,7 @@ void bind_callbacks(nb::module_ & module) {
       .def_rw("body", &EntityDescription::body)
       .def_rw("gate", &EntityDescription::gate)
       .def_rw("synchroniser", &EntityDescription::synchroniser)
+      .def_rw("loop", &EntityDescription::loop)
       .def_rw("input", &EntityDescription::input)
       .def_rw("period_ns", &EntityDescription::period_ns)
       .def_rw("due_ns", &EntityDescription::due_ns)
@@ -123,6 +127,11 @@ void bind_callbacks(nb::module_ & module) {
   record<SynchroniserDescription>(module, "SynchroniserDescription", "A synchroniser of inputs.")
       .def_rw("inputs", &SynchroniserDescription::inputs)
       .def_rw("trigger", &SynchroniserDescription::trigger, nb::arg().none());
+  record<LoopDescription>(module, "LoopDescription", "A loop in a thread of its own.")
+      .def_rw("thread", &LoopDescription::thread)
+      .def_rw("inputs", &LoopDescription::inputs)
+      .def_rw("last_ns", &LoopDescription::last_ns)
+      .def_rw("ends_chain", &LoopDescription::ends_chain);
 }
 
 // Reads and writes a field of the gate itself that is a word in Python.
@@ -187,6 +196,7 @@ void bind_description(nb::module_ & module) {
       .def_rw("publishers", &Description::publishers)
       .def_rw("gates", &Description::gates)
       .def_rw("synchronisers", &Description::synchronisers)
+      .def_rw("loops", &Description::loops)
       .def_prop_rw(
           "streams",
           [](const Description & described) {

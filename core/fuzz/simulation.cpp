@@ -66,8 +66,9 @@ EntityDescription chosen_entity(Choices & choose, Place process, Place publisher
   entity.process = process;
   entity.kind = static_cast<EntityKind>(choose.below(4));
   entity.group = choose.maybe(2);
-  entity.body = static_cast<Body>(choose.below(4));
+  entity.body = static_cast<Body>(choose.below(5));
   entity.synchroniser = choose.place(1);
+  entity.loop = choose.place(1);
   entity.input = choose.place(2);
   entity.period_ns = choose.time();
   entity.due_ns = choose.time();
@@ -109,6 +110,21 @@ ThreadDescription chosen_thread(Choices & choose, Place process, Role role) {
   return thread;
 }
 
+// Adds a loop to the last process, behind what its executor looks at.
+void choose_loop(Choices & choose, Description & all) {
+  const Place process = all.processes.size() - 1;
+  EntityDescription entity = chosen_entity(choose, process, all.publishers.size());
+  entity.kind = EntityKind::loop;
+  entity.body = Body::compute;
+  entity.loop = all.loops.size();
+  for (auto left = entity.publisher_count; left > 0; --left)
+    all.publishers.push_back(chosen_publisher(choose));
+  all.entities.push_back(entity);
+  const Nanoseconds last = choose.yes() ? all.stop_ns : choose.time();
+  all.loops.push_back({all.threads.size(), choose.below(3), last, choose.yes()});
+  all.threads.push_back(chosen_thread(choose, process, Role::loop));
+}
+
 Description chosen(Choices & choose) {
   Description all;
   all.stop_ns = 20'000;
@@ -147,12 +163,16 @@ Description chosen(Choices & choose) {
       all.threads.push_back(chosen_thread(choose, process, Role::dds));
       all.threads.back().receive = choose.place(4);
     }
+    if (choose.yes()) choose_loop(choose, all);
   }
-  // Readers that there are: mostly what no timer is.
+  for (auto & entity : all.entities)
+    if (entity.body == Body::store && all.loops.empty()) entity.body = Body::compute;
+  // Readers that there are: mostly what no timer or loop is.
   for (auto & publisher : all.publishers)
     std::erase_if(publisher.readers, [&](const Reader & reader) {
       return reader.entity >= all.entities.size() ||
-             all.entities[reader.entity].kind == EntityKind::timer;
+             all.entities[reader.entity].kind == EntityKind::timer ||
+             all.entities[reader.entity].kind == EntityKind::loop;
     });
   return all;
 }

@@ -18,6 +18,9 @@ bool Engine::begin_body(Thread & thread) {
     case Body::synchronise:
       if (!complete(thread)) return end(thread);
       break;
+    case Body::store:
+      store(thread);
+      return end(thread);
     case Body::compute:
       break;
   }
@@ -53,6 +56,10 @@ Nanoseconds Engine::computing_time(Stream & stream) {
 }
 
 bool Engine::end(Thread & thread) {
+  if (thread.loop != nullptr) {
+    end_instance(thread);
+    return false;
+  }
   log(TracePoint::callback_end, now_, &thread, {thread.entity->description->callback, thread.used});
   return false;
 }

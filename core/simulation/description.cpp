@@ -1,5 +1,6 @@
 #include "simulation/description.hpp"
 
+#include <algorithm>
 #include <stdexcept>
 #include <string>
 
@@ -58,9 +59,11 @@ void check_entity(const Description & all, const EntityDescription & entity) {
           "a callback with an unknown publisher");
   require(!entity.lifespan_ns || is_time(*entity.lifespan_ns), "a negative lifespan");
   require(entity.depth > 0, "a history without room");
-  const bool timer = entity.kind == EntityKind::timer;
+  const bool loop = entity.kind == EntityKind::loop;
+  const bool timer = entity.kind == EntityKind::timer || loop;
   require(!timer || (entity.period_ns > 0 && is_time(entity.period_ns) && is_time(entity.due_ns)),
-          "a timer without a period");
+          "a timer or loop without a period");
+  require(!loop || has(all.loops, entity.loop), "a loop without a thread");
   if (entity.body == Body::gate || entity.body == Body::mode_listener)
     require(has(all.gates, entity.gate), "a callback of an unknown gate");
   require(entity.body != Body::gate || entity.publisher_count > 0, "a gate that leads nowhere");
@@ -69,12 +72,44 @@ void check_entity(const Description & all, const EntityDescription & entity) {
                 has(all.synchronisers[entity.synchroniser].inputs, entity.input),
             "an input of an unknown synchroniser");
   }
+  if (entity.body == Body::store) {
+    require(has(all.loops, entity.loop) && entity.input < all.loops[entity.loop].inputs,
+            "an input of an unknown loop");
+  }
+}
+
+// Checks that a loop has a thread, and is the thread's only one.
+void check_loop(const Description & all, const LoopDescription & loop) {
+  require(has(all.threads, loop.thread) && all.threads[loop.thread].role == Role::loop,
+          "a loop without a thread");
+  require(is_time(loop.last_ns), "a loop that begins never");
+  const auto in_thread = [&](const auto & other) { return other.thread == loop.thread; };
+  require(std::count_if(all.loops.begin(), all.loops.end(), in_thread) == 1,
+          "two loops in a thread");
+}
+
+// Checks that each thread that is in a loop has it, and each loop its entity.
+void check_loops(const Description & all) {
+  for (const auto & loop : all.loops) check_loop(all, loop);
+  const auto loops = static_cast<std::ptrdiff_t>(all.loops.size());
+  const auto is_loop = [](const auto & entity) { return entity.kind == EntityKind::loop; };
+  const auto in_loop = [](const auto & thread) { return thread.role == Role::loop; };
+  require(std::count_if(all.entities.begin(), all.entities.end(), is_loop) == loops &&
+              std::count_if(all.threads.begin(), all.threads.end(), in_loop) == loops,
+          "loops without a thread, or threads without a loop");
+  std::vector<bool> seen(all.loops.size());
+  for (const auto & entity : all.entities) {
+    if (!is_loop(entity)) continue;
+    require(!seen[entity.loop], "a loop of two entities");
+    seen[entity.loop] = true;
+  }
 }
 
 void check_publisher(const Description & all, const PublisherDescription & publisher) {
   for (const auto & reader : publisher.readers) {
     require(has(all.entities, reader.entity) && has(all.streams, reader.delivery) &&
-                all.entities[reader.entity].kind != EntityKind::timer,
+                all.entities[reader.entity].kind != EntityKind::timer &&
+                all.entities[reader.entity].kind != EntityKind::loop,
             "a publisher with an unknown reader");
   }
   require(publisher.depth > 0, "a history without room");
@@ -102,12 +137,14 @@ void check_processes(const Description & all) {
     require(has_range(all.entities, process.first_entity, process.entity_count),
             "a process with unknown callbacks");
     for (Place place = 0; place < process.entity_count; ++place) {
-      require(&all.processes[all.entities[process.first_entity + place].process] == &process,
-              "a callback of two processes");
+      const auto & entity = all.entities[process.first_entity + place];
+      require(&all.processes[entity.process] == &process, "a callback of two processes");
+      require(entity.kind != EntityKind::loop, "an executor with a loop");
     }
   }
   for (const auto & entity : all.entities) {
-    require(executing[entity.process], "a callback without a thread");
+    require(executing[entity.process] || entity.kind == EntityKind::loop,
+            "a callback without a thread");
     for (Place place = 0; place < entity.publisher_count; ++place) {
       require(
           !all.publishers[entity.first_publisher + place].asynchronous || sending[entity.process],
@@ -123,6 +160,7 @@ void check(const Description & all) {
   for (const auto & thread : all.threads) check_thread(all, thread);
   for (const auto & entity : all.entities) check_entity(all, entity);
   for (const auto & publisher : all.publishers) check_publisher(all, publisher);
+  check_loops(all);
   for (const auto & gate : all.gates) check_gate(gate);
   for (const auto & synchroniser : all.synchronisers) {
     require(!synchroniser.inputs.empty(), "a synchroniser without inputs");

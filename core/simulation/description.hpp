@@ -37,8 +37,8 @@ struct CoreDescription {
 };
 
 // What a thread does: it runs an executor's callbacks, sends for the asynchronous publishers of its
-// process, or receives messages for DDS.
-enum class Role { executor, publisher, dds };
+// process, receives messages for DDS, or is in a loop of its own.
+enum class Role { executor, publisher, dds, loop };
 
 struct ThreadDescription {
   Place core{0};
@@ -68,11 +68,12 @@ struct ProcessDescription {
   Place entity_count{0};
 };
 
-// What an executor waits for.
-enum class EntityKind { timer, subscription, service, client };
+// What an executor waits for. A loop is no callback: a thread of its own runs it, and no executor
+// looks at it.
+enum class EntityKind { timer, subscription, service, client, loop };
 
 // What the callback of an entity does.
-enum class Body { compute, gate, mode_listener, synchronise };
+enum class Body { compute, gate, mode_listener, synchronise, store };
 
 struct EntityDescription {
   // Handles, as events have them:
@@ -85,9 +86,10 @@ struct EntityDescription {
   Body body{Body::compute};
   Place gate{0};             // of a gate, or of a listener for a gate's modes
   Place synchroniser{0};     // of an input of a synchroniser
-  Place input{0};            // which input of the synchroniser it is
-  Nanoseconds period_ns{1};  // of a timer
-  Nanoseconds due_ns{0};     // when a timer expires first
+  Place loop{0};             // of a loop, or of an input that is stored for a loop
+  Place input{0};            // which input of the synchroniser or loop it is
+  Nanoseconds period_ns{1};  // of a timer or loop
+  Nanoseconds due_ns{0};     // when a timer expires first, or a loop begins
   Place execution{0};        // stream of CPU times of the callback before it publishes
   MaybePlace afterwards;     // stream of CPU times after it has published; none: it ends then
   Place first_publisher{0};  // it publishes with these publishers, in their order
@@ -135,6 +137,16 @@ struct SynchroniserDescription {
   MaybePlace trigger;
 };
 
+// A loop sleeps until multiples of its entity's period. Each instance uses the newest message of
+// each input that was stored before the instance began. When timers expire no more, it begins only
+// instances that have something new to use.
+struct LoopDescription {
+  Place thread{0};         // its own
+  std::size_t inputs{0};   // of so many topics it uses the newest message
+  Nanoseconds last_ns{0};  // it begins no instance afterwards
+  bool ends_chain{false};  // the end of an instance ends the chain
+};
+
 // A sequence of CPU times or delays: a constant, or numbers that the engine asks for in blocks.
 struct StreamDescription {
   std::optional<Nanoseconds> constant_ns;
@@ -148,6 +160,7 @@ struct Description {
   std::vector<PublisherDescription> publishers;
   std::vector<GateDescription> gates;
   std::vector<SynchroniserDescription> synchronisers;
+  std::vector<LoopDescription> loops;
   std::vector<StreamDescription> streams;
   std::size_t groups{0};
   Nanoseconds cycle_ns{0};           // of the plan in force; 0: no plan is

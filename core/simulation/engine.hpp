@@ -24,6 +24,10 @@
 // * Events executors (events_executor.cpp) run callbacks in the order in which messages came and
 //   timers expired; each of these is an event.
 //
+// Loops. A thread that is in a loop sleeps until multiples of its period, as a `std::thread` with
+// `sleep_until` does; multiples that its instance has missed are left out. What an instance uses
+// was stored by callbacks of the process's executor that were over when the instance began.
+//
 // A message reaches every reader of its topic after a delay, in order. A DDS thread of the reader's
 // process may have to work for it first. An asynchronous publisher first hands it to the publisher
 // thread of its process.
@@ -115,6 +119,13 @@ private:
   bool complete(Thread & thread);
   Nanoseconds computing_time(Stream & stream);
 
+  // loops.cpp: threads that are in a loop
+  void store(const Thread & thread);
+  void begin_instance(Thread & thread);
+  void use_stored(Thread & thread);
+  void end_instance(Thread & thread);
+  void fall_asleep(Thread & thread);
+
   // gates.cpp: callbacks that are gates
   bool enter_gate(Thread & thread);
   bool pass_gate(Thread & thread);
@@ -130,7 +141,7 @@ private:
   void publish(Thread & thread, Publisher & publisher);
   void hand_over(Thread & thread, Publisher & publisher, Message & message);
   void send(Thread & thread, Message & message);
-  void note_latency(const Message & message);
+  void note_latency(const Carried & carried);
   void deliver(Message & message);
   void arrive(Message & message);
   void send_or_receive(Thread & thread);
@@ -150,6 +161,7 @@ private:
   void set_up_threads();
   void set_up_entities();
   void set_up_publishers();
+  void set_up_loops();
 
   Description description_;
   Source source_;
@@ -161,6 +173,7 @@ private:
   std::vector<Publisher> publishers_;
   std::deque<GateAtWork> gates_;
   std::vector<Synchroniser> synchronisers_;
+  std::vector<LoopAtWork> loops_;
   std::deque<bool> groups_;  // whether each callback group is busy
 
   Nanoseconds now_{0};

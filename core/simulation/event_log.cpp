@@ -18,6 +18,8 @@ const std::vector<EntryNames> & log_layout() {
         "anchor", "overrun", "mode", "dropped", "moved"}},
       {"asynchronous_send", {"rmw_publisher_handle", "timestamp", "outcome", "duration"}},
       {"context_switch", {"core", "previous", "runnable"}},
+      {"thread_sleep", {"until", "call", "thread_time"}},
+      {"thread_wake", {"call", "thread_time"}},
   };
   return names;
 }

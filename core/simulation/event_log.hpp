@@ -28,6 +28,8 @@ enum class TracePoint : std::size_t {
   release,
   send,
   context_switch,
+  sleep,
+  wake,
 };
 
 struct EntryNames {

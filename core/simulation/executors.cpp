@@ -11,6 +11,9 @@ void Engine::advance(Thread & thread) {
   while (thread.runnable && thread.left == 0 && pause_ != Pause::endless) {
     count_step();
     switch (thread.step) {
+      case Step::begin_instance:
+        begin_instance(thread);
+        break;
       case Step::collect:
         collect(thread);
         break;
@@ -29,6 +32,10 @@ void Engine::advance(Thread & thread) {
       case Step::gate_published:
       case Step::gate_paused:
         if (go_on_with_callback(thread)) break;
+        if (thread.loop != nullptr) {
+          fall_asleep(thread);
+          break;
+        }
         if (thread.entity->group_is_busy != nullptr) {
           *thread.entity->group_is_busy = false;
           wake_owner(*thread.executor);

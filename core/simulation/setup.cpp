@@ -12,6 +12,8 @@ Step first_step(Role role, bool first_of_executor) {
       return Step::send;
     case Role::dds:
       return Step::receive;
+    case Role::loop:
+      return Step::begin_instance;
     case Role::executor:
       break;
   }
@@ -41,6 +43,10 @@ Engine::Engine(Description description, Source source)
     for (const auto & input : described.inputs)
       synchroniser.inputs.push_back({input.on_chain, input.depth, {}});
   }
+  for (const auto & loop : description_.loops) {
+    loops_.push_back({&loop, nullptr, {}});
+    loops_.back().inputs.resize(loop.inputs);
+  }
   // They will point to each other, so each list gets its size before the first pointer is taken.
   threads_.resize(description_.threads.size());
   executors_.resize(description_.processes.size());
@@ -49,6 +55,7 @@ Engine::Engine(Description description, Source source)
   set_up_publishers();
   set_up_entities();
   set_up_threads();
+  set_up_loops();
 }
 
 void Engine::set_up_threads() {
@@ -101,11 +108,25 @@ void Engine::set_up_entities() {
     entity.gate = of_gate ? &gates_[description.gate] : nullptr;
     entity.synchroniser =
         description.body == Body::synchronise ? &synchronisers_[description.synchroniser] : nullptr;
+    const bool of_loop = description.kind == EntityKind::loop || description.body == Body::store;
+    entity.loop = of_loop ? &loops_[description.loop] : nullptr;
     entity.due = description.due_ns;
     if (description.kind == EntityKind::timer) expiries.emplace_back(description.due_ns, &entity);
   }
   std::sort(expiries.begin(), expiries.end());  // of the same time, in the order of the list
   for (const auto & [due, entity] : expiries) agenda_.plan(due, Expiry{entity});
+}
+
+// Lets the threads that are in loops sleep until the first instance.
+void Engine::set_up_loops() {
+  for (Entity & entity : entities_)
+    if (entity.description->kind == EntityKind::loop) entity.loop->entity = &entity;
+  for (LoopAtWork & loop : loops_) {
+    Thread & thread = threads_[loop.description->thread];
+    thread.loop = &loop;
+    if (loop.entity->due <= loop.description->last_ns)
+      agenda_.plan(loop.entity->due, SleepOver{&thread});
+  }
 }
 
 void Engine::set_up_publishers() {

@@ -5,6 +5,7 @@
 
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 #include <deque>
 #include <optional>
@@ -20,6 +21,7 @@ namespace chainshaper::simulation {
 
 struct Thread;
 struct Executor;
+struct LoopAtWork;
 
 struct Core {
   explicit Core(const CoreDescription & described)
@@ -57,6 +59,8 @@ enum class Step {
   // Of a thread of DDS:
   receive,
   received,
+  // Of a thread in a loop:
+  begin_instance,
 };
 
 struct Thread {
@@ -82,6 +86,7 @@ struct Thread {
   Publisher * sending{nullptr};      // of a publisher thread
   std::deque<Publisher *> to_send;   // of a publisher thread
   MessageQueue to_receive;           // of a thread of DDS
+  LoopAtWork * loop{nullptr};        // in which it is
   Carried carried;                   // what the message at which it works carries
   std::optional<Nanoseconds> began;  // when it began to send, or its gate woke up
 };
@@ -125,6 +130,29 @@ struct Synchroniser {
   MaybePlace trigger;
 };
 
+// A loop, and what the executor of its process has stored for it.
+struct LoopAtWork {
+  // What the newest message of an input carries, and the newest one from before the instant
+  // `since`. An instance that begins at that instant uses the latter.
+  struct Stored {
+    std::optional<Carried> newest;
+    std::optional<Carried> before;
+    Nanoseconds since{-1};
+  };
+
+  // Whether an instance that begins now has something that the one before had not.
+  bool has_news(Nanoseconds now) const {
+    return std::any_of(inputs.begin(), inputs.end(), [&](const Stored & stored) {
+      return stored.since >= begun && stored.since < now;
+    });
+  }
+
+  const LoopDescription * description;
+  Entity * entity{nullptr};
+  std::vector<Stored> inputs;
+  Nanoseconds begun{0};  // when the last instance began
+};
+
 struct Entity {
   const EntityDescription * description;
   Executor * executor;
@@ -134,9 +162,10 @@ struct Entity {
   std::span<Publisher> publishers;
   GateAtWork * gate;
   Synchroniser * synchroniser;
+  LoopAtWork * loop;  // whose entity it is, or for which its callback stores messages
 
   MessageQueue history;
-  Nanoseconds due;    // of a timer
+  Nanoseconds due;    // of a timer or loop
   bool ready{false};  // in the executor's snapshot
 
   bool may_run() const { return group_is_busy == nullptr || !*group_is_busy; }

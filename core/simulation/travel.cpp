@@ -56,7 +56,7 @@ void Engine::hand_over(Thread & sender, Publisher & publisher, Message & message
 
 // Sends a message now; each reader gets a copy.
 void Engine::send(Thread & thread, Message & message) {
-  note_latency(message);
+  if (message.publisher->description->ends_chain) note_latency(message.carried);
   for (ReaderOf & reader : message.publisher->readers) {
     Message & copy = new_message();
     copy = message;
@@ -72,10 +72,9 @@ void Engine::send(Thread & thread, Message & message) {
   messages_.give_back(message);
 }
 
-void Engine::note_latency(const Message & message) {
-  const Carried & carried = message.carried;
-  if (!message.publisher->description->ends_chain || !carried.chain_start) return;
-  if (carried.instance >= latencies_.size()) return;
+// Notes that an instance of the chain ends, unless it has ended before.
+void Engine::note_latency(const Carried & carried) {
+  if (!carried.chain_start || carried.instance >= latencies_.size()) return;
   Nanoseconds & latency = latencies_[carried.instance];
   if (latency == absent) latency = now_ - *carried.chain_start;
 }

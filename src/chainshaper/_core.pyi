@@ -352,6 +352,7 @@ class Role(Enum):
     executor = 0
     publisher = 1
     dds = 2
+    loop = 3
 
 class ExecutorKind(Enum):
     """In which order an executor runs callbacks that are ready."""
@@ -368,6 +369,7 @@ class EntityKind(Enum):
     subscription = 1
     service = 2
     client = 3
+    loop = 4
 
 class Body(Enum):
     """What a callback does."""
@@ -376,6 +378,7 @@ class Body(Enum):
     gate = 1
     mode_listener = 2
     synchronise = 3
+    store = 4
 
 class CoreDescription:
     """A core.
@@ -456,6 +459,7 @@ class EntityDescription:
     body: Body
     gate: int
     synchroniser: int
+    loop: int
     input: int
     period_ns: int
     due_ns: int
@@ -479,6 +483,7 @@ class EntityDescription:
         body: Body = ...,
         gate: int = ...,
         synchroniser: int = ...,
+        loop: int = ...,
         input: int = ...,
         period_ns: int = ...,
         due_ns: int = ...,
@@ -594,6 +599,22 @@ class SynchroniserDescription:
         trigger: int | None = ...,
     ) -> None: ...
 
+class LoopDescription:
+    """A loop in a thread of its own, which uses the newest message of each of its ``inputs``."""
+
+    thread: int
+    inputs: int
+    last_ns: int
+    ends_chain: bool
+    def __init__(
+        self,
+        *,
+        thread: int = ...,
+        inputs: int = ...,
+        last_ns: int = ...,
+        ends_chain: bool = ...,
+    ) -> None: ...
+
 class Description:
     """All of a simulation; ``streams`` are constants, or None for one that is drawn."""
 
@@ -604,6 +625,7 @@ class Description:
     publishers: list[PublisherDescription]
     gates: list[GateDescription]
     synchronisers: list[SynchroniserDescription]
+    loops: list[LoopDescription]
     streams: list[int | None]
     groups: int
     cycle_ns: int
@@ -629,6 +651,7 @@ class Description:
         publishers: Sequence[PublisherDescription] = ...,
         gates: Sequence[GateDescription] = ...,
         synchronisers: Sequence[SynchroniserDescription] = ...,
+        loops: Sequence[LoopDescription] = ...,
         streams: Sequence[int | None] = ...,
         groups: int = ...,
         cycle_ns: int = ...,

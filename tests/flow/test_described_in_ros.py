@@ -12,9 +12,10 @@ import numpy.typing as npt
 import pytest
 from command_line import called
 from known import known
-from small_chain import PERIOD_NS, small_chain, small_chain_text
+from small_chain import DDS_CORE, EXECUTOR_CORE, PERIOD_NS, small_chain, small_chain_text
 
-from chainshaper import measure_latency, open_recording
+from chainshaper import load_application, measure_latency, open_recording
+from chainshaper.analysis import callback_statistics, data_flow
 from chainshaper.flow import described_in_ros
 from chainshaper.flow.described_in_ros import check_ros, run_in_ros
 from chainshaper.linux.scheduling import may_use_fifo
@@ -96,6 +97,40 @@ def test_a_node_that_fails_is_an_error_with_what_it_said(
     with pytest.raises(OperationError, match=r"its nodes said last: .*omain"):
         run_in_ros(small_chain(tmp_path), tmp_path / "recording", cycles=CYCLES)
     assert {path.name for path in tmp_path.iterdir()} <= {"small_chain.yaml", "recording"}
+
+
+LOOP = f"""\
+name: a loop
+chain: /scan../command
+scheduling:
+  executors: {{core: {EXECUTOR_CORE}, priority: 80}}
+  dds: {{core: {DDS_CORE}, priority: 90}}
+nodes:
+  sensor: {{callbacks: [{{timer: 40ms, execution: {{constant: 1ms}}, publishes: [/scan]}}]}}
+  controller:
+    callbacks:
+      - {{loop: 20ms, reads: [/scan], execution: {{constant: 1ms}}, publishes: [/command]}}
+  arm: {{callbacks: [{{subscription: /command, execution: {{constant: 100us}}}}]}}
+"""
+
+
+@pytest.mark.ros2
+@pytest.mark.usefixtures("in_ros2")
+@pytest.mark.timeout(400)
+def test_a_chain_leads_through_the_loop_of_a_node_in_python(tmp_path: Path) -> None:
+    (tmp_path / "app.yaml").write_text(LOOP)
+    application = load_application(tmp_path / "app.yaml")
+    recording = run_in_ros(application, tmp_path / "recording", cycles=CYCLES)
+    assert recording.events["loop_named"].select("name", "is_thread").unique().rows() == [
+        ("loop", 1)
+    ]
+    statistics = callback_statistics(data_flow(recording.events))
+    (loop,) = statistics.filter(kind="loop", node="/controller").to_dicts()
+    assert loop["period_ns"] == 20 * MS
+    assert loop["count"] > CYCLES
+    for chain in ("/scan../command", "/scan../controller:end"):
+        complete = measure_latency(recording.path, chain).analysis.traversals.filter("complete")
+        assert CYCLES // 2 < complete.height <= CYCLES + 10, "no repeat counts as a cycle"
 
 
 def test_without_ros_2_it_says_where_one_comes_from(

@@ -12,6 +12,7 @@ from chainshaper.analysis import analyse_latency
 from chainshaper.flow.describing import application_file
 from chainshaper.simulation import simulate
 from chainshaper.sources import open_source
+from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application, load_application
 
@@ -177,3 +178,25 @@ def test_long_recordings_have_the_cycles_with_extremes_written(
     described = _described(robot, tmp_path)
     times = described.nodes["planner"].callbacks[0].execution.sequence_ns or ()
     assert max(times) == pytest.approx(41_000_000, rel=0.05)
+
+
+LOOP = """
+name: to the actuator
+chain: /scan../controller
+scheduling: {executors: {core: 1, priority: 80}, dds: {core: 0, priority: 90}}
+nodes:
+  lidar: {callbacks: [{timer: 20ms, execution: {constant: 1ms}, publishes: [/scan]}]}
+  planner: {callbacks: [{subscription: /scan, execution: {constant: 2ms}, publishes: [/command]}]}
+  controller: {callbacks: [{loop: 10ms, reads: [/command], execution: {constant: 1ms}}]}
+"""
+
+
+def test_a_chain_that_ends_with_a_loop_is_described_up_to_what_the_loop_reads(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "app.yaml").write_text(LOOP)
+    recording = simulate(load_application(tmp_path / "app.yaml"), tmp_path / "recording", cycles=20)
+    with pytest.raises(InputError, match=r"ends with an instance of a loop.*add the loop by hand"):
+        application_file(recording)
+    described = _described(recording, tmp_path, "/scan../command")
+    assert described.nodes.keys() == {"lidar", "planner", "controller"}

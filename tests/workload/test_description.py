@@ -193,3 +193,43 @@ def test_a_node_that_is_bound_to_no_core_asks_for_none(tmp_path: Path) -> None:
     assert {0, 1, 7} == load_application(path).cores().keys()
     path.write_text(path.read_text().replace("core: 7", "core: 7\n    bound: false"))
     assert {0, 1} == load_application(path).cores().keys()
+
+
+LOOP = """
+name: feedback
+chain: /command../state
+scheduling: {executors: {core: 1, priority: 80}, dds: {core: 0, priority: 90}}
+nodes:
+  controller:
+    callbacks:
+      - loop: 10ms
+        phase: 2ms
+        core: 2
+        priority: 85
+        reads: [/state]
+        execution: {constant: 1ms}
+        publishes: [/command]
+  plant:
+    callbacks:
+      - {subscription: /command, publishes: [/state]}
+"""
+
+
+def test_a_loop_has_its_own_core_and_may_close_a_circle_of_topics(tmp_path: Path) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_text(LOOP)
+    application = load_application(path)
+    name, loop = origin_timer(application)
+    assert (name, loop.period_ns, loop.phase_ns) == ("controller", 10_000_000, 2_000_000)
+    assert (loop.inputs, loop.subscriptions) == ((), ("/state",))
+    scheduling = application.loop_scheduling_of("controller")
+    assert scheduling is not None
+    assert (scheduling.core, scheduling.priority) == (2, 85)
+    assert application.loop_scheduling_of("plant") is None
+    assert application.cores()[2] == "the loop of node controller"
+    (written,) = application_as_written(application)["nodes"]["controller"]["callbacks"]
+    assert written["loop"] == "10ms"
+    path.write_text(LOOP.replace("        core: 2\n        priority: 85\n", ""))
+    assert load_application(path).loop_scheduling_of("controller") == application.scheduling_of(
+        "controller"
+    )

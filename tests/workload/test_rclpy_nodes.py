@@ -53,6 +53,36 @@ def test_nodes_get_the_times_of_the_live_workload_and_their_scheduling(tmp_path:
     assert [node["scheduling"] for node in described(fair)] == [None] * 4
 
 
+LOOP = """\
+name: a loop
+chain: /scan../command
+scheduling: {executors: {core: 1, priority: 80}, dds: {core: 0, priority: 90}}
+nodes:
+  lidar: {callbacks: [{timer: 20ms, publishes: [/scan]}]}
+  controller:
+    callbacks:
+      - loop: 5ms
+        phase: 1ms
+        priority: 85
+        reads: [/scan]
+        execution: {constant: 1ms}
+        publishes: [/command]
+  arm: {callbacks: [{subscription: /command}]}
+"""
+
+
+def test_a_loop_gets_its_period_what_it_reads_and_its_scheduling(tmp_path: Path) -> None:
+    (tmp_path / "app.yaml").write_text(LOOP)
+    application = cs.load_application(tmp_path / "app.yaml")
+    lidar, controller, _ = described(write_rclpy_nodes(application, tmp_path, realtime=True))
+    (loop,) = controller["callbacks"]
+    assert (loop["loop_ns"], loop["phase_ns"], loop["reads"]) == (5_000_000, 1_000_000, ["/scan"])
+    assert controller["scheduling"]["loop"] == {"core": 1, "priority": 85}
+    assert controller["topics"].keys() == {"/scan", "/command"}
+    assert lidar["topics"]["/scan"]["is_taken"], "nobody would wait for the loop's subscription"
+    assert "loop" not in lidar["scheduling"]
+
+
 def described(nodes: WrittenNodes) -> list[dict[str, Any]]:
     return [json.loads(file.with_suffix(".json").read_text()) for file in nodes.ready]
 

@@ -129,6 +129,10 @@ def test_a_package_has_what_the_description_says(tmp_path: Path) -> None:
             },
             "log: callback 0: `gate` .* `chainshaper shape`",
         ),
+        (
+            {"[{subscription: /fused": "[{loop: 5ms, reads: [/fused]"},
+            "log: callback 0: `loop` .* describe a `timer`",
+        ),
     ],
 )
 def test_what_a_generated_node_cannot_do_is_refused(

@@ -29,6 +29,7 @@ from chainshaper.values.files import write_whole
 from chainshaper.values.progress import Progress
 from chainshaper.values.recording import Recording, refuse_existing
 from chainshaper.workload.description import Application, origin_timer
+from chainshaper.workload.launcher import LOOP_NAME
 from chainshaper.workload.live import fifo_permitted
 from chainshaper.workload.rclpy_nodes import WrittenNodes, write_rclpy_nodes
 from chainshaper.workload.timing import WARM_UP_CYCLES
@@ -73,7 +74,7 @@ def run_in_ros(
     check_cores(application.cores())
     permitted = fifo_permitted(realtime)
     realtime = permitted if realtime is None else realtime
-    period_ns = origin_timer(application)[1].timer_ns or 0
+    period_ns = origin_timer(application)[1].period_ns or 0
     with tempfile.TemporaryDirectory(prefix=f".{output.name}.nodes-", dir=output.parent) as place:
         if plan is not None:
             application = placed_application(application, plan)
@@ -93,6 +94,7 @@ def run_in_ros(
                 source="preload",
                 duration_ns=cycles * period_ns,
                 chain=application.chain,
+                loops=(LOOP_NAME,) if any(node.loop for node in application.nodes.values()) else (),
                 scheduling=_warmed_up(nodes.ready, WARM_UP_CYCLES * period_ns),
                 plan=plan,
                 gate_logs=gates.logs,

@@ -327,7 +327,7 @@ def application_at(grid: Grid, values: Values) -> Application:
         _refuse_unknown_node(name, described)
     if (load := changes.get(INTERFERENCE)) is not None:
         _, timer = origin_timer(grid.application)
-        described = _interfered(described, timer.timer_ns or 0, _nanoseconds(INTERFERENCE, load))
+        described = _interfered(described, timer.period_ns or 0, _nanoseconds(INTERFERENCE, load))
     return _changed(Application, described, changes, without=INTERFERENCE)
 
 

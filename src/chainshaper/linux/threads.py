@@ -32,7 +32,7 @@ POLICIES: dict[int, str] = {getattr(os, name): name for name in _OF_PYTHON}
 POLICIES[SCHED_DEADLINE] = "SCHED_DEADLINE"
 POLICIES[7] = "SCHED_LITMUS" if Path("/proc/litmus").is_dir() else "SCHED_EXT"
 
-ThreadRole: TypeAlias = Literal["executor", "publisher", "dds", "unknown"]
+ThreadRole: TypeAlias = Literal["executor", "publisher", "dds", "loop", "unknown"]
 """``publisher``: sends what executors hand over to it (paper, section 2.2)."""
 
 

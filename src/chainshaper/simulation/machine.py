@@ -15,8 +15,15 @@ from chainshaper.planning.chain_plan import ReceiverPlace, Server
 from chainshaper.planning.plan import Plan
 from chainshaper.robot.gate import values_of
 from chainshaper.simulation.system import ROLES, Entity, SimulatedPublisher, System
+from chainshaper.values.application import LOOP_END
 from chainshaper.values.errors import InputError
-from chainshaper.workload.description import CallbackDescription, ExecutionTime, TopicDescription
+from chainshaper.workload.description import (
+    MOST_THREADS,
+    CallbackDescription,
+    ExecutionTime,
+    TopicDescription,
+    origin_timer,
+)
 from chainshaper.workload.execution import FIRST_AFTER, blocks
 from chainshaper.workload.timing import Timing
 
@@ -26,12 +33,14 @@ FIRST_COST = 1 << 20
 """Threads' costs are numbered from here, a node's callbacks from 0: each draws its own sequence."""
 FIRST_DELIVERY = 1 << 21
 """Deliveries are numbered from here, by publishing node, callback and input."""
+OF_EXECUTORS = 3  # roles whose threads' costs are numbered together, one by one
 COSTS = ("wake_up", "take", "publish", "receive", "delivery")  # numbered in this order
 BEST_EFFORT = 1000  # the rank of threads of the fair class, behind all real-time ones
 LOG_ROWS = 1 << 17  # of a kind, in a part of the log
 INSTANTS = 1 << 18  # after so many the engine pauses, so that Ctrl-C ends the simulation
 POOL = 4096  # room for messages under way, besides those in histories
 
+_NO_TIME = ExecutionTime(constant_ns=0)
 _EXECUTORS = {
     "single-threaded": _core.ExecutorKind.single_threaded,
     "static": _core.ExecutorKind.static_single_threaded,
@@ -92,6 +101,7 @@ class Machine:
         self._groups: dict[tuple[int, str], int] = {}
         self._gates: list[_core.GateDescription] = []
         self._synchronisers: list[_core.SynchroniserDescription] = []
+        self._loops: list[_core.LoopDescription] = []
         threads = self._threads()
         cores = self._cores(threads)
         entities = self._entities()
@@ -107,6 +117,7 @@ class Machine:
             publishers=publishers,
             gates=self._gates,
             synchronisers=self._synchronisers,
+            loops=self._loops,
             streams=self._streams.constants,
             groups=len(self._groups),
             cycle_ns=0 if plan is None else plan.cycle_ns,
@@ -146,7 +157,8 @@ class Machine:
         for info in system.threads:
             several[self._numbers[info.pid]] += info.role == "executor"
         kind = _EXECUTORS[system.application.simulation.executor]
-        of_process = [entity.process for entity in system.entities]
+        # Its loop, at which no executor looks, is the last entity of a process.
+        of_process = [-1 if entity.kind == "loop" else entity.process for entity in system.entities]
         for number, threads in enumerate(several):
             count = of_process.count(number)
             processes.append(
@@ -166,10 +178,13 @@ class Machine:
             assert info.role is not None  # noqa: S101 - of a simulated thread it is known
             worker = executing.get(info.pid, 0) if info.role == "executor" else 0
             executing[info.pid] = executing.get(info.pid, 0) + (info.role == "executor")
-            first = FIRST_COST + len(COSTS) * (ROLES.index(info.role) + len(ROLES) * worker)
+            if info.role == "loop":
+                worker = MOST_THREADS  # behind those of any executor
+            place = ROLES.index(info.role) % OF_EXECUTORS + OF_EXECUTORS * worker
+            first = FIRST_COST + len(COSTS) * place
             costs = {
-                name: self._streams.add(times, info.node, first + place)
-                for place, name in enumerate(COSTS)
+                name: self._streams.add(times, info.node, first + number)
+                for number, name in enumerate(COSTS)
                 if (times := getattr(described, name)) is not None
             }
             threads.append(
@@ -256,7 +271,7 @@ class Machine:
 
     def _entities(self) -> list[_core.EntityDescription]:
         system, entities = self._system, []
-        # The entities of a callback share its streams, and its gate or synchroniser.
+        # The entities of a callback share its streams, and its gate, synchroniser or loop.
         executions: dict[tuple[int, int], tuple[int, int | None]] = {}
         bodies: dict[tuple[int, int], int] = {}
         for number, entity in enumerate(system.entities):
@@ -264,10 +279,12 @@ class Machine:
             if key not in executions:
                 executions[key] = self._executions(entity)
             if key not in bodies:
-                bodies[key] = self._add_body(entity.described)
+                bodies[key] = self._add_body(entity)
             group = system.application.nodes[process.key].exclusive_group(entity.described)
             callback, handle, rmw_handle = self._handles.entities[number]
             execution, afterwards = executions[key]
+            if entity.stores:  # in no time
+                execution, afterwards = self._streams.add(_NO_TIME, None, 0), None
             described = _core.EntityDescription(
                 callback=callback,
                 handle=handle,
@@ -299,8 +316,12 @@ class Machine:
     def _group(self, process: int, group: str) -> int:
         return self._groups.setdefault((process, group), len(self._groups))
 
-    def _add_body(self, described: CallbackDescription) -> int:
-        """Add the callback's gate or synchroniser, if it has one; return its place."""
+    def _add_body(self, entity: Entity) -> int:
+        """Add the callback's gate, synchroniser or loop, if it has one; return its place."""
+        described = entity.described
+        if described.loop_ns is not None:
+            self._loops.append(self._loop(entity))
+            return len(self._loops) - 1
         if described.gate is not None:
             self._gates.append(self._gate(described))
             return len(self._gates) - 1
@@ -313,10 +334,25 @@ class Machine:
             self._synchronisers.append(synchroniser)
         return len(self._synchronisers) - 1
 
+    def _loop(self, entity: Entity) -> _core.LoopDescription:
+        process, reads = self._system.processes[entity.process], entity.described.reads
+        threads = [(info.pid, info.role) for info in self._system.threads]
+        starts_chain = origin_timer(self._system.application)[1] is entity.described
+        return _core.LoopDescription(
+            thread=threads.index((process.pid, "loop")),
+            inputs=len(reads),
+            last_ns=self._timing.last_timer_ns if starts_chain else self._timing.stop_ns,
+            ends_chain=self._system.chain.topics[-1:] == (process.node + LOOP_END,),
+        )
+
     def _set_body(
         self, described: _core.EntityDescription, entity: Entity, place: int, on_chain: bool
     ) -> None:
-        if entity.described.gate is not None:
+        if entity.described.loop_ns is not None:
+            described.loop, described.input = place, entity.number
+            if entity.stores:
+                described.body = _core.Body.store
+        elif entity.described.gate is not None:
             described.body = _core.Body.mode_listener if entity.listens else _core.Body.gate
             described.gate = place
         elif entity.described.synchronises:
@@ -332,7 +368,7 @@ class Machine:
         if entity.topic is None:
             key = system.processes[entity.process].key
             drift = system.application.simulation.drift.get(key, 0)
-            period = (entity.described.timer_ns or 0) * (1 - drift / 1_000_000)
+            period = (entity.described.period_ns or 0) * (1 - drift / 1_000_000)
             described.period_ns = max(1, round(period))
             described.due_ns = self._timing.start_ns + entity.described.phase_ns
         else:
@@ -366,14 +402,17 @@ class Machine:
     def _publishers(self) -> list[_core.PublisherDescription]:
         system, publishers = self._system, []
         owner = {place: entity for entity in system.entities for place in entity.publishers}
-        last = system.chain.callbacks[-1:]
+        last = [
+            (system.entities[place].process, system.entities[place].index)
+            for place in system.chain.callbacks[-1:]
+        ]
         reading: dict[str | None, list[int]] = {}
         for number, entity in enumerate(system.entities):
             reading.setdefault(entity.topic, []).append(number)
         for number, publisher in enumerate(system.publishers):
             topic: TopicDescription = system.application.topic(publisher.topic)
             handle, rmw_handle = self._handles.publishers[number]
-            ends = any(number in system.entities[entity].publishers for entity in last)
+            ends = (owner[number].process, owner[number].index) in last
             announces = owner[number].described.announces
             readers = [
                 _core.ReaderDescription(

@@ -145,7 +145,7 @@ def _checked(
         else:  # a baseline
             application = at_offsets(application, plan)
     timing = timing_of(application, cycles, START_NS)
-    slowest = max((cb.timer_ns or 0) + cb.phase_ns for _, cb in application.callbacks())
+    slowest = max((cb.period_ns or 0) + cb.phase_ns for _, cb in application.callbacks())
     if timing.stop_ns + slowest > LONGEST_NS:
         raise InputError(
             f"{cycles} cycles with the durations of {application.name!r} would end in"
@@ -223,6 +223,10 @@ def _create_objects(system: System) -> tuple[list[live.ProcessLog], Handles]:
     entities = []
     for entity in system.entities:
         log = logs[entity.process]
+        if entity.kind == "loop":
+            log.loop(system.processes[entity.process].node)
+            entities.append((0, 0, 0))
+            continue
         filtered = "message_filters::" if entity.described.synchronises else ""
         node = system.processes[entity.process].node
         callback = log.callback(f"{filtered}{node}::callback{entity.index}")
@@ -295,10 +299,13 @@ def with_recorded_times(
     return application.model_copy(update={"nodes": nodes})
 
 
-_Trigger: TypeAlias = str | int  # a topic, or a timer's period
+_Trigger: TypeAlias = str | int  # a topic, a timer's period, or `_LOOP`
+_LOOP = "its loop"  # of which a node has one
 
 
 def _triggers(callback: CallbackDescription) -> tuple[_Trigger, ...]:
+    if callback.loop_ns is not None:
+        return (_LOOP,)
     return callback.subscriptions if callback.timer_ns is None else (callback.timer_ns,)
 
 
@@ -353,7 +360,8 @@ def _computing_times(flow: DataFlow) -> dict[tuple[str, _Trigger], list[pl.DataF
         published: whether it published.
     """
     published = flow.publications.group_by("instance").agg(first=pl.col("time").min())
-    callbacks = flow.objects.callbacks.select("callback_id", "node", "topic", "period_ns")
+    of_callback = ("callback_id", "node", "topic", "period_ns", "kind")
+    callbacks = flow.objects.callbacks.select(of_callback)
     frame = (
         flow.instances.join(published, on="instance", how="left")
         .join(callbacks.unique("callback_id"), on="callback_id")
@@ -365,9 +373,10 @@ def _computing_times(flow: DataFlow) -> dict[tuple[str, _Trigger], list[pl.DataF
         .sort("callback_id")  # they are numbered in order of registration
     )
     frames: dict[tuple[str, _Trigger], list[pl.DataFrame]] = {}
-    columns = ("callback_id", "node", "topic", "period_ns")
-    for (_, node, topic, period), rows in frame.group_by(*columns, maintain_order=True):
-        trigger = str(topic) if period is None else int(period)
+    for (_, node, topic, period, kind), rows in frame.group_by(*of_callback, maintain_order=True):
+        trigger: _Trigger = str(topic) if period is None else int(period)
+        if kind == "loop":
+            trigger = _LOOP
         instances = rows.select("start", "used", "published")
         frames.setdefault((str(node), trigger), []).append(instances)
     return frames

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from chainshaper.analysis.chains import find_chain
 from chainshaper.planning.chain_plan import ReceiverPlace, Server, Thread
 from chainshaper.planning.plan import Plan
-from chainshaper.values.application import ApplicationGraph, Callback, Chain, Node
+from chainshaper.values.application import LOOP_END, ApplicationGraph, Callback, Chain, Node
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import ThreadInfo
 from chainshaper.workload.description import (
@@ -18,28 +18,34 @@ from chainshaper.workload.description import (
     CallbackDescription,
     node_name,
 )
+from chainshaper.workload.launcher import LOOP_NAME
 
 FIRST_PID = 1000  # of the processes
 FIRST_TID = 100_000  # of an executor's threads behind its first
-ROLES = ("executor", "publisher", "dds")
-KINDS = ("timer", "subscription", "service", "client")
-"""The order in which executors look for ready callbacks (Jazzy)."""
-STATIC_ORDER = ("subscription", "timer", "client", "service")
+ROLES = ("executor", "publisher", "dds", "loop")
+KINDS = ("timer", "subscription", "service", "client", "loop")
+"""The order in which executors look for ready callbacks (Jazzy); at loops they do not look."""
+STATIC_ORDER = ("subscription", "timer", "client", "service", "loop")
 """The order in which the static single-threaded executor looks for them (Jazzy)."""
 
 
 @dataclass(frozen=True)
 class Entity:
-    """A timer or a subscription with its callback."""
+    """A timer or a subscription with its callback, or a loop."""
 
     process: int  # place in the system's processes
     index: int  # of the callback in its node
-    number: int  # of the input of a synchronising callback
+    number: int  # of the input of a synchronising callback, or of what a loop reads
     kind: str  # one of KINDS
-    topic: str | None  # None: a timer
+    topic: str | None  # None: a timer or a loop
     described: CallbackDescription
     publishers: tuple[int, ...]  # places in the system's publishers
     listens: bool = False  # to the modes that are announced for the callback's gate
+
+    @property
+    def stores(self) -> bool:
+        """Whether it is a subscription whose messages are stored for its node's loop."""
+        return self.topic is not None and self.described.loop_ns is not None
 
 
 class SimulatedPublisher(NamedTuple):
@@ -137,6 +143,11 @@ def _entities(
             publishers.append(SimulatedPublisher(process, topic, asynchronous))
         if described.timer_ns is not None:
             yield Entity(process, index, 0, "timer", None, described, places)
+        if described.loop_ns is not None:
+            yield Entity(process, index, 0, "loop", None, described, places)
+            for number, topic in enumerate(described.reads):
+                yield Entity(process, index, number, "subscription", topic, described, ())
+            continue
         # Subscriptions to the modes of a gate stand before the inputs.
         of_modes = len(described.subscriptions) - len(described.inputs)
         for number, topic in enumerate(described.subscriptions):
@@ -153,7 +164,7 @@ def _threads(
     processes: Sequence[SimulatedProcess],
     publishers: Sequence[SimulatedPublisher],
 ) -> Iterator[ThreadInfo]:
-    """Yield each process's threads: of its executor, its publisher thread, its DDS thread."""
+    """Yield each process's threads: of its executor, its publisher, DDS, its loop."""
     for number, process in enumerate(processes):
         executor = application.scheduling_of(process.key)
         name = process.node.strip("/").replace("/", ".")[:15]
@@ -165,6 +176,8 @@ def _threads(
         if application.simulation.receive is not None:
             dds = application.dds_scheduling_of(process.key)
             threads.append(("dds", "dds.dds", dds.core, dds.priority))
+        if (loop := application.loop_scheduling_of(process.key)) is not None:
+            threads.append(("loop", LOOP_NAME, loop.core, loop.priority))
         for place, (role, comm, core, priority) in enumerate(threads):
             tid = process.pid + ROLES.index(role)
             if 0 < place < len(executing):
@@ -188,7 +201,7 @@ def _servers(plan: Plan, threads: Sequence[ThreadInfo]) -> dict[int, Server]:
     """
     places: dict[Thread, list[int]] = {}
     for place, info in enumerate(threads):
-        if info.role != "dds":
+        if info.role in ("executor", "publisher"):
             planned = Thread(node=info.node, role=info.role)  # type: ignore[arg-type]
             places.setdefault(planned, []).append(place)
     server_of: dict[int, Server] = {}
@@ -216,6 +229,17 @@ def _receivers(
     }
 
 
+def _publishes(
+    entity: Entity,
+    processes: Sequence[SimulatedProcess],
+    publishers: Sequence[SimulatedPublisher],
+) -> tuple[str, ...]:
+    """The topics of an entity; those of a loop are also of what is stored for it, with its end."""
+    if entity.described.loop_ns is None:
+        return tuple(publishers[publisher].topic for publisher in entity.publishers)
+    return (*entity.described.publishes, processes[entity.process].node + LOOP_END)
+
+
 def _graph(
     processes: Sequence[SimulatedProcess],
     entities: Sequence[Entity],
@@ -223,18 +247,24 @@ def _graph(
 ) -> ApplicationGraph:
     """The graph in which the chain is found; the id of a callback is its entity's place.
 
-    Callbacks alone publish here, so topics need not name their nodes.
+    Callbacks alone publish here, so topics need not name their nodes. What is stored for a loop
+    passes on what the loop publishes.
     """
     callbacks = [
         Callback(
             id=number,
-            kind="timer" if entity.kind == "timer" else "subscription",
+            kind="loop"
+            if entity.kind == "loop"
+            else "timer"
+            if entity.topic is None
+            else "subscription",
             node=processes[entity.process].node,
             pid=processes[entity.process].pid,
             handle=number,
             topic=entity.topic,
-            period_ns=entity.described.timer_ns,
-            publishes=tuple(publishers[publisher].topic for publisher in entity.publishers),
+            period_ns=None if entity.topic is not None else entity.described.period_ns,
+            publishes=_publishes(entity, processes, publishers),
+            passes_on=_publishes(entity, processes, publishers) if entity.stores else (),
         )
         for number, entity in enumerate(entities)
     ]

@@ -67,11 +67,11 @@ def at_offsets(application: Application, plan: Plan) -> Application:
     for chain in plan.chains:
         name, timer = origin_timer(application, chain.chain.spec)
         period_ns = chain.chain.period_ns
-        if timer.timer_ns != period_ns:
+        if timer.period_ns != period_ns:
             raise InputError(
                 f"the plan is for a chain with the period {duration_text(period_ns)}, but"
                 f" {chain.chain.spec or application.chain} of {application.name!r} has"
-                f" {duration_text(timer.timer_ns or 0)}: plan again from a recording of this"
+                f" {duration_text(timer.period_ns or 0)}: plan again from a recording of this"
                 " application"
             )
         if plan.moves_timers:

@@ -59,7 +59,7 @@ class ThreadInfo(BaseModel, frozen=True):
     pid: Integer
     comm: str
     node: str
-    role: str  # executor, dds, publisher, stall-meter, unknown
+    role: str  # executor, dds, publisher, loop, stall-meter, unknown
     policy: str  # SCHED_FIFO, SCHED_OTHER, ...
     priority: Integer
     cores: tuple[Integer, ...]

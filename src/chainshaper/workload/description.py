@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_origin
 from pydantic import Field, create_model, model_validator
 
 from chainshaper.robot.gate import Gate, GateModes, Late, limit_of
+from chainshaper.values.application import LOOP_END
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Publication
 from chainshaper.values.yaml_file import (
@@ -228,10 +229,12 @@ class GateDescription(_DescribedGate):
 class CallbackDescription(Part):
     """A callback: what triggers it, what it does, and the topics it publishes.
 
-    What triggers it, one of the first three:
+    What triggers it, one of the first four:
 
     * ``timer_ns``: a timer of this period; ``phase_ns`` delays its first expiry after the common
       start.
+    * ``loop_ns``: no callback at all, but a thread of the node that sleeps until multiples of this
+      period, behind ``phase_ns``, and is then awake for an instance.
     * ``subscription``: the messages of this topic.
     * ``synchronises``: these topics, when a message of each has come. The stamp that it passes on
       is that of the first topic's message.
@@ -240,6 +243,12 @@ class CallbackDescription(Part):
     * ``kind``: executors look at services and clients after subscriptions of topics.
     * ``group``: one of its node's ``callback_groups``; None: the node's default group, which is
       mutually exclusive.
+
+    Of a loop:
+
+    * ``reads``: topics of which it uses the newest message that the node's executor has stored
+      before the instance began. The stamp that it passes on is that of the first topic's message.
+    * ``core``, ``priority``: of its thread; None: those of the node's executor.
 
     What it does:
 
@@ -253,7 +262,11 @@ class CallbackDescription(Part):
     """
 
     timer_ns: PositiveDuration | None = None
+    loop_ns: PositiveDuration | None = None
     phase_ns: Duration = 0
+    reads: tuple[FullName, ...] = ()
+    core: Core | None = None
+    priority: Priority | None = None
     subscription: FullName | None = None
     synchronises: tuple[FullName, ...] = ()
     triggered_by: FullName | None = None
@@ -270,8 +283,13 @@ class CallbackDescription(Part):
     def subscriptions(self) -> tuple[str, ...]:
         """All topics that are subscribed to for this callback, that of the gate's modes first."""
         if self.gate is None or self.gate.modes is None:
-            return self.inputs
+            return self.inputs or self.reads
         return (self.gate.modes.topic, *self.inputs)
+
+    @property
+    def period_ns(self) -> int | None:
+        """The period of its timer or loop; None: messages trigger it."""
+        return self.loop_ns if self.timer_ns is None else self.timer_ns
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -280,17 +298,20 @@ class CallbackDescription(Part):
 
     @model_validator(mode="after")
     def _one_trigger(self) -> "CallbackDescription":
-        if (self.timer_ns, self.subscription, self.synchronises or None).count(None) != 2:
+        triggers = (self.timer_ns, self.loop_ns, self.subscription, self.synchronises or None)
+        if triggers.count(None) != len(triggers) - 1:
             raise wrong_value(
-                "give either `timer: PERIOD` or `subscription: TOPIC` or `synchronises: [TOPICS]`"
+                "give either `timer: PERIOD` or `loop: PERIOD` or `subscription: TOPIC` or"
+                " `synchronises: [TOPICS]`"
             )
         if len(self.synchronises) == 1 or len(set(self.synchronises)) < len(self.synchronises):
             raise wrong_value("name two topics at least, each of them once", "synchronises")
         if self.triggered_by not in (None, *self.synchronises):
             raise wrong_value("write one of the topics that it `synchronises`", "triggered_by")
-        if self.phase_ns and self.timer_ns is None:
-            reason = "a phase is a timer's delay after the common start: remove it"
+        if self.phase_ns and self.period_ns is None:
+            reason = "a phase is a timer's or loop's delay after the common start: remove it"
             raise wrong_value(reason, "phase")
+        self._check_loop()
         if self.gate is not None and (self.subscription is None or len(self.publishes) != 1):
             raise wrong_value("a gate forwards one subscription to exactly one topic", "gate")
         if self.computes is not None:
@@ -303,6 +324,24 @@ class CallbackDescription(Part):
         if self.announces and len(self.publishes) != 1:
             raise wrong_value("modes are announced on exactly one topic", "announces")
         return self
+
+    def _check_loop(self) -> None:
+        """Refuse what only a loop has elsewhere, and what a loop has not."""
+        if self.loop_ns is None:
+            for key, reason in (
+                ("reads", "a loop reads what has arrived: write `loop: PERIOD`, or `subscription`"),
+                ("core", "is of a loop's thread: write it beside the node's `callbacks`"),
+                ("priority", "is of a loop's thread: write it beside the node's `callbacks`"),
+            ):
+                if getattr(self, key) not in (None, ()):
+                    raise wrong_value(reason, key)
+        elif self.computes is not None:
+            raise wrong_value("a loop calls no function: describe its `execution`", "computes")
+        elif self.execution.constant_ns == 0:  # its waking up and its sleep would be one instant
+            reason = "an instance of a loop takes time: describe it, such as {constant: 500us}"
+            raise wrong_value(reason, "execution")
+        if len(set(self.reads)) < len(self.reads):
+            raise wrong_value("name each topic once", "reads")
 
 
 class NodeDescription(Part):
@@ -348,7 +387,30 @@ class NodeDescription(Part):
             if callback.gate is not None and self.threads > 1:
                 reason = "a gate needs a node with a single-threaded executor"
                 raise wrong_value(reason, "callbacks", number, "gate")
+        self._check_loops()
         return self
+
+    @property
+    def loop(self) -> CallbackDescription | None:
+        """Its loop; None: it has none."""
+        return next((callback for callback in self.callbacks if callback.loop_ns is not None), None)
+
+    def _check_loops(self) -> None:
+        """Refuse a second loop, and callbacks that would be in its loop's way."""
+        for number, callback in enumerate(self.callbacks):
+            where = ("callbacks", number)
+            if callback.loop_ns is not None and callback is not self.loop:
+                reason = "a node has one loop thread, which is in a loop already: describe another"
+                raise wrong_value(f"{reason} node with this one", *where, "loop")
+            if self.loop is None or callback is self.loop:
+                continue
+            if callback.gate is not None:
+                reason = "while a gate waits, nothing is stored for the loop: give it its own node"
+                raise wrong_value(reason, *where, "gate")
+            if again := [topic for topic in callback.subscriptions if topic in self.loop.reads]:
+                reason = f"the node's loop `reads` {again[0]}, so that the node subscribes to it"
+                key = "synchronises" if callback.subscription is None else "subscription"
+                raise wrong_value(f"{reason} already: remove one of the two", *where, key)
 
     def exclusive_group(self, callback: CallbackDescription) -> str | None:
         """Return the group of which it runs alone; None: it may run beside any other callback.
@@ -411,6 +473,7 @@ class Application(Part):
                 raise wrong_value("is published by no node: remove it", "topics", topic)
         # A run takes a while, so a chain that could not be found in its recording is refused here.
         known = {*published, *map(node_name, self.nodes)}
+        known |= {node_name(name) + LOOP_END for name, node in self.nodes.items() if node.loop}
         for way_point in map(str.strip, self.chain.split("..")):
             if "/" + way_point.removeprefix("/") not in known:
                 reason = f"no topic or node is called {way_point!r}: write way points of "
@@ -445,9 +508,10 @@ class Application(Part):
     def _refuse_unpublished(
         self, callback: CallbackDescription, published: set[str], where: tuple[str | int, ...]
     ) -> None:
-        for wanted in callback.inputs:
+        for wanted in callback.inputs or callback.reads:
             if wanted not in published:
                 key = "synchronises" if callback.subscription is None else "subscription"
+                key = "reads" if callback.reads else key
                 known = ", ".join(sorted(published)) or "no topics"
                 raise wrong_value(f"no node publishes {wanted}; published are {known}", *where, key)
         modes = None if callback.gate is None else callback.gate.modes
@@ -491,11 +555,24 @@ class Application(Part):
         priority, dds = self.nodes[node].dds_priority, self.scheduling.dds
         return dds if priority is None else Scheduling(core=dds.core, priority=priority)
 
+    def loop_scheduling_of(self, node: str) -> Scheduling | None:
+        """Return core and priority of the thread of a node's loop; None: the node has none."""
+        executor, loop = self.scheduling_of(node), self.nodes[node].loop
+        if loop is None:
+            return None
+        core = executor.core if loop.core is None else loop.core
+        return Scheduling(core=core, priority=loop.priority or executor.priority)
+
     def cores(self) -> dict[int, str]:
         """Return every core that threads of the application are bound to, and what asks for it."""
         bound = [name for name, node in self.nodes.items() if node.bound]
         executors = {core: f"node {name}" for name in bound for core in self.cores_of(name)}
-        return {self.scheduling.dds.core: "scheduling.dds", **executors}
+        loops = {
+            loop.core: f"the loop of node {name}"
+            for name in bound
+            if (loop := self.loop_scheduling_of(name)) is not None
+        }
+        return {self.scheduling.dds.core: "scheduling.dds", **loops, **executors}
 
 
 def node_name(name: str) -> str:
@@ -506,7 +583,7 @@ def node_name(name: str) -> str:
 def origin_timer(
     application: Application, chain: str | None = None
 ) -> tuple[str, CallbackDescription]:
-    """Return the timer callback that starts a chain, or leads to its start, and its node's name.
+    """Return the timer or loop that starts a chain, or leads to its start, and its node's name.
 
     The chain is the application's, unless another is given. Raises InputError: no callback begins
     it.
@@ -518,8 +595,9 @@ def origin_timer(
         for name, callback in application.callbacks()
         if f"/{first}" in callback.publishes or first == name.strip("/")
     ]
-    # This ends at a timer, since every topic has a publisher, and topics form no cycle.
-    while starts and all(callback.timer_ns is None for _, callback in starts):
+    # This ends at a timer or loop, since every topic has a publisher, and topics that trigger
+    # callbacks form no cycle.
+    while starts and all(callback.period_ns is None for _, callback in starts):
         inputs = {topic for _, callback in starts for topic in callback.subscriptions}
         starts = [
             (name, callback)
@@ -530,7 +608,7 @@ def origin_timer(
         lacks = f"has no /{first}, with which the chain {chain} begins"
         remedy = "plan again from a recording of this application"
         raise InputError(f"the application {application.name!r} {lacks}: {remedy}")
-    return next((name, callback) for name, callback in starts if callback.timer_ns is not None)
+    return next((name, callback) for name, callback in starts if callback.period_ns is not None)
 
 
 def load_application(path: str | Path) -> Application:

@@ -20,6 +20,7 @@ from typing import Any
 
 from chainshaper.robot.decision import DROPPED
 from chainshaper.robot.gate import ANCHORS, LATE, MESSAGES
+from chainshaper.values.event_declarations import SLEEPING_CALLS
 
 _RELEASE = "callback source_timestamp arrival origin release slot cycles_waited anchor overrun mode"
 LAYOUT: dict[str, tuple[str, ...]] = {
@@ -32,6 +33,8 @@ LAYOUT: dict[str, tuple[str, ...]] = {
     "gate_release": (*_RELEASE.split(), "dropped", "moved"),
     "asynchronous_send": ("rmw_publisher_handle", "timestamp", "outcome", "duration"),
     "machine_stall": ("duration",),
+    "thread_sleep": ("until", "call", "thread_time"),
+    "thread_wake": ("call", "thread_time"),
 }
 """Kinds of entries, and the order of their fields. The number of a kind is its place here."""
 ALSO_TAKEN = ("rcl_take", "rclcpp_take")  # only where a message was taken
@@ -56,6 +59,7 @@ WORDS: dict[str, tuple[str, ...]] = {
 }
 """Words are recorded as their places in these lists; a ``mode`` by its place among its gate's."""
 
+CLOCK_NANOSLEEP = SLEEPING_CALLS.index("clock_nanosleep")  # by which loops sleep
 FIRST_HANDLE = 0x55D0_0000_0100  # like a real address; other processes have the same
 
 
@@ -132,6 +136,10 @@ class EventLog:
         self.init("rclcpp_subscription_init", subscription_handle=handle, subscription=of_rclcpp)
         self.init("rclcpp_subscription_callback_added", subscription=of_rclcpp, callback=callback)
         return handle, rmw_handle
+
+    def loop(self, node: str) -> None:
+        """Record that the process's node, by its full name, has a loop, which is no callback."""
+        self.init("loop_named", name=node, is_thread=0)
 
     def point(self, entry: str) -> Callable[..., None]:
         """Return a fast function that records an entry of this kind, for the calling thread.

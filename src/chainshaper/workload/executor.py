@@ -148,7 +148,7 @@ class NodeExecutor:
             stop_ns, last_timer_ns = self._begin.get()
             self._spin(stop_ns, last_timer_ns)
         except BaseException as error:  # otherwise the thread alone would end, its group busy
-            _end_process(error.code if isinstance(error, SystemExit) else traceback.format_exc())
+            end_process(error.code if isinstance(error, SystemExit) else traceback.format_exc())
 
     def _spin(self, stop_ns: int, last_timer_ns: int) -> None:
         """Run callbacks on the calling thread until the end."""
@@ -290,7 +290,7 @@ class AsynchronousWriter:
             return None
 
 
-def _end_process(said: object) -> None:
+def end_process(said: object) -> None:
     """End this process from a thread of it, with a reason for whoever started it."""
     sys.stderr.write(f"{said}\n")
     sys.stderr.flush()
@@ -313,7 +313,7 @@ def start_publisher_thread() -> "queue.SimpleQueue[AsynchronousWriter]":
         try:
             send()
         except BaseException:  # otherwise the thread alone would end, and nothing be sent
-            _end_process(traceback.format_exc())
+            end_process(traceback.format_exc())
 
     threading.Thread(target=send_or_end, daemon=True).start()
     return waiting

@@ -35,6 +35,7 @@ ANSWER_S = 60.0  # a child that is silent for longer, discovery included, hangs
 DYING_S = 2.0  # how long a child that has closed its pipe may take to end
 Model = TypeVar("Model", bound="BaseModel")
 WORKER_NAME = "executor"  # of a node's threads that execute beside its main one
+LOOP_NAME = "loop"  # of the thread of a node's loop
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,12 @@ from chainshaper.linux.scheduling import (
     check_cores,
     may_use_fifo,
 )
-from chainshaper.linux.threads import RunningThread, foreign_realtime_processes, list_threads
+from chainshaper.linux.threads import (
+    RunningThread,
+    ThreadRole,
+    foreign_realtime_processes,
+    list_threads,
+)
 from chainshaper.robot.clocks import clock_offset
 from chainshaper.values import events
 from chainshaper.values.durations import duration_text
@@ -246,7 +251,7 @@ def _between_releases(application: Application) -> int:
 
 def _sooner(application: Application, cycles: int, timing: Timing) -> Timing:
     """Move a run earlier, by as many whole hyper-periods of its timers as there is time for."""
-    periods = [callback.timer_ns for _, callback in application.callbacks() if callback.timer_ns]
+    periods = [period for _, callback in application.callbacks() if (period := callback.period_ns)]
     hyper_period_ns = math.lcm(*periods)
     spare_ns = max(0, timing.start_ns - LEAD_NS - time.monotonic_ns())
     earlier_ns = spare_ns // hyper_period_ns * hyper_period_ns
@@ -306,6 +311,7 @@ def _setup_of(application: Application, name: str, domain: int, realtime: bool) 
         discovery_ns=DISCOVERY_NS,
         seed=application.seed,
         parent=os.getpid(),
+        starts_chain=origin_timer(application)[0] == name,
         origin_phase_ns=origin_timer(application)[1].phase_ns,
         delivery_core=dds.core if realtime and dds.core != executor.core else None,
     )
@@ -330,6 +336,7 @@ def _allocate_threads(application: Application, nodes: dict[str, Child], realtim
     """Give every thread its core and, where permitted, its SCHED_FIFO priority."""
     for name, child in nodes.items():
         executor, dds = application.scheduling_of(name), application.dds_scheduling_of(name)
+        loop = application.loop_scheduling_of(name)
         cores = iter(application.cores_of(name))
         for thread in node_threads(child.pid):
             core, priority = dds.core, dds.priority
@@ -338,8 +345,11 @@ def _allocate_threads(application: Application, nodes: dict[str, Child], realtim
             elif thread.role == "publisher":
                 # Below the executor: it shares the writer's lock with it, and may spin on it.
                 core, priority = executor.core, max(1, executor.priority - 1)
+            elif thread.role == "loop" and loop is not None:
+                core, priority = loop.core, loop.priority
             cores_of_thread: tuple[int, ...] = (core,)
-            if thread.role in ("executor", "publisher") and not application.nodes[name].bound:
+            described = thread.role in ("executor", "publisher", "loop")
+            if described and not application.nodes[name].bound:
                 cores_of_thread = tuple(available_cores())
             wanted = SchedulingRequest(priority if realtime else None, cores=cores_of_thread)
             apply_scheduling(thread, wanted)
@@ -410,11 +420,15 @@ def _thread_info(thread: RunningThread, node: str, role: str) -> ThreadInfo:
 def node_threads(pid: int) -> list[RunningThread]:
     """Return the threads of a node's process, with their roles.
 
-    Executors are the main thread and those named `WORKER_NAME`. Threads that a callback's module
-    has started execute nothing; they have the name of the thread that loaded it.
+    Executors are the main thread and those named `WORKER_NAME`; its loop's is `LOOP_NAME`. Threads
+    that a callback's module has started execute nothing; they have the name of the thread that
+    loaded it.
     """
+    roles: dict[str, ThreadRole] = {launcher.WORKER_NAME: "executor", launcher.LOOP_NAME: "loop"}
     return [
-        replace(thread, role="executor") if thread.comm == launcher.WORKER_NAME else thread
+        replace(
+            thread, role=thread.role if thread.tid == pid else roles.get(thread.comm, thread.role)
+        )
         for thread in list_threads(pid)
     ]
 

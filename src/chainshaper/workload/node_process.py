@@ -24,6 +24,7 @@ from chainshaper.workload.description import CallbackDescription, ExecutionTime,
 from chainshaper.workload.event_log import EventLog, number_of
 from chainshaper.workload.execution import FIRST_AFTER, ExecutionTimes, spend
 from chainshaper.workload.gate_callback import GateCallback, GateHandles, shaper_of
+from chainshaper.workload.loop import Loop
 from chainshaper.workload.node_setup import NodeSetup
 from chainshaper.workload.traced import TracedPublisher, traced_callback
 
@@ -57,7 +58,8 @@ class NodeProcess:
         self.to_send: queue.SimpleQueue[executor.AsynchronousWriter] | None = None
         self.shapers: list[tuple[Shaper, GateDescription]] = []
         self.execution_times: list[ExecutionTimes] = []
-        self._several = setup.node.threads > 1
+        self.loop: Loop | None = None
+        self._several = setup.node.threads > 1 or setup.node.loop is not None
         self.log.node(setup.name, "live workload")
         numbered = enumerate(setup.node.callbacks)
         for index, callback in sorted(numbered, key=lambda pair: KINDS.index(pair[1].kind)):
@@ -74,6 +76,16 @@ class NodeProcess:
         publishers = [self._publisher(topic) for topic in callback.publishes]
         work = self._work(index, callback, publishers)
         rest = self._rest(index, callback.afterwards)
+        if callback.loop_ns is not None:
+            body = _body(work, publishers, rest)
+            topics = callback.reads
+            self.loop = Loop(callback.loop_ns, callback.phase_ns, len(topics), body, self.log)
+            self.log.loop(self.setup.name)
+            for number, topic in enumerate(topics):
+                handle = self.log.callback(symbol)
+                store = traced_callback(self.log, handle, partial(self.loop.store, number))
+                self._subscribe(handle, topic, store, group)
+            return
         if callback.synchronises:
             self._add_synchroniser(symbol, callback, partial(_body, work, publishers, rest))
             return
@@ -254,7 +266,9 @@ class NodeProcess:
         """Execute callbacks from the common start until the end."""
         for timer in self.executor.timers:
             timer.due_ns += start_ns
-        periods = [timer.period_ns for timer in self.executor.timers] or [100_000_000]
+        periods = [timer.period_ns for timer in self.executor.timers]
+        periods += [] if self.loop is None else [self.loop.period_ns]
+        periods = periods or [100_000_000]
         for times in self.execution_times:
             times.refill(min(1 + (stop_ns - start_ns) // min(periods), 100_000))
         for shaper, gate in self.shapers:
@@ -262,7 +276,13 @@ class NodeProcess:
             for from_ns, by_ns in gate.moved(start_ns):
                 shaper.queue.move_slots(by_ns, from_ns)
         scheduling.stop_garbage_collection()
+        if self.loop is not None:
+            last_ns = last_timer_ns if self.setup.starts_chain else stop_ns
+            self.loop.begin(start_ns, last_timer_ns, last_ns)
         self.executor.spin_until(stop_ns, last_timer_ns)
+        if self.loop is not None:
+            self.loop.over = True
+            self.loop.wait_for_end()
 
 
 def _body(

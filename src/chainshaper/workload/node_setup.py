@@ -27,5 +27,6 @@ class NodeSetup(Part):
     discovery_ns: int  # how long discovery may take
     seed: int  # of execution times
     parent: int  # pid of the launcher, with which the process ends
+    starts_chain: bool  # whether its timer or loop does
     origin_phase_ns: int  # where cycles begin behind the start, for gates that do not say
     delivery_core: int | None  # of DDS threads, if they are real-time and have a core of their own

@@ -115,14 +115,17 @@ def _described(application: Application, name: str, realtime: bool) -> dict[str,
     """Return what the program reads of a node."""
     node = application.nodes[name]
     topics = {topic for callback in node.callbacks for topic in callback.publishes}
-    topics.update(topic for callback in node.callbacks for topic in callback.inputs)
+    topics.update(topic for callback in node.callbacks for topic in callback.subscriptions)
     scheduling = None
     if realtime:
         threads = {
             "executor": application.scheduling_of(name),
             "dds": application.dds_scheduling_of(name),
+            "loop": application.loop_scheduling_of(name),
         }
-        scheduling = {which: wanted.model_dump() for which, wanted in threads.items()}
+        scheduling = {
+            which: wanted.model_dump() for which, wanted in threads.items() if wanted is not None
+        }
     return {
         "callbacks": [
             _callback(application, name, number) for number in range(len(node.callbacks))
@@ -148,6 +151,8 @@ def _callback(application: Application, name: str, number: int) -> dict[str, Any
 
     return {
         "timer_ns": callback.timer_ns,
+        "loop_ns": callback.loop_ns,
+        "reads": callback.reads,
         "phase_ns": callback.phase_ns,
         "subscription": callback.subscription,
         "execution_ns": drawn(callback.execution, number),
@@ -163,7 +168,7 @@ def _topic(application: Application, topic: str) -> dict[str, Any]:
         "reliability": described.reliability,
         "lifespan_ns": described.lifespan_ns,
         "payload": described.payload,
-        "is_taken": any(topic in callback.inputs for _, callback in application.callbacks()),
+        "is_taken": any(topic in callback.subscriptions for _, callback in application.callbacks()),
     }
 
 

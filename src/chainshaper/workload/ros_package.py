@@ -117,6 +117,8 @@ def _refuse(application: Application, place: str, callback: CallbackDescription)
         "computes": callback.computes is not None
         and "a function in Python, which no node in C++ calls; describe its `execution` instead, "
         "such as the `samples` of a recording",
+        "loop": callback.loop_ns is not None
+        and "a thread of its own, which generated nodes have not; describe a `timer` instead",
         "kind": callback.kind != "subscription"
         and f"a {callback.kind}'s messages on a topic, which ROS 2 has not; remove `kind`",
         "subscription": not announced.isdisjoint(callback.inputs)

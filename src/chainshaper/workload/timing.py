@@ -34,7 +34,7 @@ def timing_of(application: Application, cycles: int, start_ns: int) -> Timing:
     in two. The run goes on after the last cycle until what began in it is complete.
     """
     _, timer = origin_timer(application)
-    period_ns = timer.timer_ns or 0
+    period_ns = timer.period_ns or 0
     anchor_ns = start_ns + timer.phase_ns
     first_ns = anchor_ns + WARM_UP_CYCLES * period_ns
     end_ns = first_ns + cycles * period_ns

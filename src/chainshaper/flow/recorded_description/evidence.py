@@ -17,7 +17,13 @@ from chainshaper.analysis.occupation import (
 from chainshaper.flow.exploration import list_chains
 from chainshaper.flow.recorded_description.timers import blocker_of
 from chainshaper.values import events
-from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Callback, Chain
+from chainshaper.values.application import (
+    INTERNAL_TOPICS,
+    LOOP_END,
+    ApplicationGraph,
+    Callback,
+    Chain,
+)
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
 
@@ -45,8 +51,8 @@ class Evidence:
 
 
 def own_topics(callback: Callback) -> list[str]:
-    """Return the topics that a callback publishes itself."""
-    left_out = INTERNAL_TOPICS | {*callback.passes_on}
+    """Return the topics that a callback publishes itself; the end of a loop's instance is none."""
+    left_out = INTERNAL_TOPICS | {*callback.passes_on, callback.node + LOOP_END}
     return [topic for topic in callback.publishes if topic not in left_out]
 
 
@@ -60,6 +66,12 @@ def evidence_of(recording: Recording, chain: str | None) -> Evidence:
     if heaviest is None:
         raise InputError(f"{recording.path}: no chain is in it, see `chainshaper graph`")
     path = find_chain(graph, chain or recording.info.chain or heaviest.spec)
+    if path.topics[-1].endswith(LOOP_END):
+        raise InputError(
+            f"{recording.path}: the chain {path.spec} ends with an instance of a loop, and loops"
+            " are not described from recordings: give a chain to what the loop reads (--chain), and"
+            " add the loop by hand"
+        )
     counting = publication_that_counts(flow, frozenset(path.topics))
     occupied = occupation(flow, recording.info, counting)
     callbacks = {callback.id: callback for callback in graph.callbacks}
