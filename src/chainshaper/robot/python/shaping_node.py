@@ -41,7 +41,10 @@ from chainshaper.robot.python.node import (
 from chainshaper.robot.shaper import Shaper
 from chainshaper.robot.waiting import Outcome
 
-DISCOVERY_S, SETTLING_S = 2.0, 0.1
+DISCOVERY_S = 2.0
+# With Fast DDS a receiver's process may wait for a third of a second as it opens the shared memory
+# of each of this node's two ports (upstream: `SharedMemGlobal.hpp`, `healthy_check`).
+SETTLING_S = 0.8
 REHEARSAL_TOPIC = "/_chainshaper_rehearsal"  # of all shaping nodes; the underscore hides it
 EMPTY = bytes((0, 1, 0, 0, 0))  # a serialized std_msgs/Empty
 REHEARSAL_NS = 400_000  # no rehearsal begins later before a release: the first may take as long

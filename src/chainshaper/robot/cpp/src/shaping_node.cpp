@@ -261,7 +261,11 @@ public:
     const auto topic = node_.get_node_topics_interface()->resolve_topic_name("output");
     const auto give_up = monotonic_ns() + 2'000'000'000;
     while (turn_ && turn_->has_standby() && goes_on() && monotonic_ns() < give_up) {
-      if (output_->get_subscription_count() >= node_.count_subscribers(topic)) return wait(0.1);
+      if (output_->get_subscription_count() >= node_.count_subscribers(topic)) {
+        // With Fast DDS a receiver's process may wait for a third of a second as it opens the
+        // shared memory of each of this node's two ports (`SharedMemGlobal.hpp`, `healthy_check`).
+        return wait(0.8);
+      }
       wait(0.01);
     }
     return goes_on();
