@@ -321,6 +321,9 @@ def _turns_of(
 def _callback(callback_id: int, loop: _Loop, turns: pl.DataFrame) -> pl.DataFrame:
     """Make the row of a loop among callbacks."""
     period = regular_period(turns["start"].sort().to_numpy())
+    due = turns["due"].drop_nulls().sort().to_numpy()
+    if period is not None and due.size == turns.height:  # more exact than when it woke up
+        period = regular_period(due) or period
     row = {
         "callback_id": callback_id,
         "pid": loop.pid,
