@@ -62,6 +62,20 @@ def _bands(bands: int = 3) -> ChainPlan:
     return plan_chain(PROFILE, PlanRequest(bands=bands, publish_slot_ns=MS))
 
 
+@pytest.mark.parametrize(("late", "is_kept"), [(1, True), (30, False)])
+def test_late_outputs_within_the_promised_share_break_no_promise(
+    like: LatencyAnalysis, late: int, is_kept: bool
+) -> None:
+    """They decide the maximum and the jitter; so one of 320 outputs had the promise broken."""
+    plan = revised(_bands(1), margin=Margin(epsilon_ns=MS, overrun_probability=0.01))
+    ((start, end),) = publish_slots(plan)
+    latencies = [start + 50_000] * (320 - late) + [end + MS // 2] * late
+    judged = judge_prediction(plan, _measured(latencies, like, due=end))
+    assert judged.max.worse
+    assert judged.jitter.worse
+    assert (judged.broken == ()) is is_kept
+
+
 def test_outputs_at_slot_starts_are_as_predicted(like: LatencyAnalysis) -> None:
     plan = _bands()
     starts = [start for start, _ in publish_slots(plan)]
