@@ -136,13 +136,13 @@ def jitter_of(latencies: NDArray[np.int64]) -> float:
 def beside(machine: str) -> Iterator[None]:
     """Have others use the machine meanwhile."""
     parts = {"quiet": [], "busy": ["computing"] * 2, "stalling": ["0", "1"]}[machine]
-    others = [subprocess.Popen([sys.executable, __file__, f"--as={part}"]) for part in parts]
+    processes = [subprocess.Popen([sys.executable, __file__, f"--as={part}"]) for part in parts]
     try:
         yield
     finally:
-        for other in others:
-            other.kill()
-            other.wait()
+        for process in processes:
+            process.kill()
+            process.wait()
 
 
 def compute() -> None:

@@ -74,6 +74,10 @@ def test_late_outputs_within_the_promised_share_break_no_promise(
     assert judged.max.worse
     assert judged.jitter.worse
     assert (judged.broken == ()) is is_kept
+    # What is in time has to be as near together as promised, however few are late.
+    apart = [start + 50_000, end + MS // 4] * (160 - late) + [end + MS // 2] * late
+    wide = judge_prediction(plan, _measured(apart, like, due=end + MS // 3))
+    assert any(text.startswith("jitter") for text in wide.broken)
 
 
 def test_outputs_at_slot_starts_are_as_predicted(like: LatencyAnalysis) -> None:

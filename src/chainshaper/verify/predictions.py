@@ -132,6 +132,7 @@ class JudgedPrediction:
     mean: JudgedFigure
     max: JudgedFigure
     jitter: JudgedFigure
+    in_time: tuple[JudgedFigure, JudgedFigure]  # maximum and jitter without the late outputs
     bands: tuple[JudgedBand, ...]
     """() for policies without slots."""
     late: int  # number of outputs that missed their last slot; in the figures, not in the bands
@@ -144,12 +145,13 @@ class JudgedPrediction:
     def broken(self) -> tuple[str, ...]:
         """Texts of the promises that the measurement breaks, each with its figures.
 
-        The plan promises which share of the outputs is in time. Late ones within that share decide
-        the maximum and the jitter, and break no promise.
+        The plan promises which share of the outputs is in time. Late ones within that share break
+        no promise: the maximum and the jitter are judged without them.
         """
-        named = {"average": self.mean}
-        if not (self.late and self.outputs.promised and self.outputs.kept):
-            named |= {"maximum": self.max, "jitter": self.jitter}
+        longest, jitter = self.max, self.jitter
+        if self.late and self.outputs.promised and self.outputs.kept:
+            longest, jitter = self.in_time
+        named = {"average": self.mean, "maximum": longest, "jitter": jitter}
         broken = [
             f"{name} {milliseconds(figure.measured_ns)} ms, not {figure.range_text} ms"
             for name, figure in named.items()
@@ -241,10 +243,14 @@ def judge_prediction(plan: ChainPlan, analysis: LatencyAnalysis) -> JudgedPredic
             judged = _band(slots[band - 1], share, of_mode.filter(~pl.col("late")), of_mode.height)
             bands.append(replace(judged, mode=mode, late=int(of_mode["late"].sum())))
     mean, longest, jitter = _figures(plan, slots, latency_statistics(outputs["judged_ns"]))
+    _, longest_in_time, jitter_in_time = _figures(
+        plan, slots, latency_statistics(in_time["judged_ns"])
+    )
     return JudgedPrediction(
         mean=mean,
         max=longest,
         jitter=jitter,
+        in_time=(longest_in_time, jitter_in_time),
         bands=tuple(bands),
         late=int(outputs["late"].sum()),
         outputs=outputs_due(analysis, plan),
