@@ -38,7 +38,7 @@ LIVE_RUN = re.compile(
     r"chainshaper (?P<verb>run|shape) (?P<files>\S+\.yaml( \S+\.yaml)?) -o (?P<output>\S+)"
     r" --cycles (?P<cycles>\d+)"
 )
-RUNS_LIVE = re.compile(r"^chainshaper (apply|demo|run|shape)\b|run_application")
+RUNS_LIVE = re.compile(r"^chainshaper (apply|demo|release|run|shape)\b|run_application")
 CYCLES = (12, 40, 120)
 pytestmark = pytest.mark.waiting  # for the cores
 
