@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.planning import chain_plan as plans
-from chainshaper.planning import margins, shaping
+from chainshaper.planning import loops, margins, shaping
 from chainshaper.planning.bands import (
     BandChoice,
     choose_bands,
@@ -118,6 +118,7 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
     refuse_simulated((profile, *sinks), request)
     if not keeps_places(request):
         profile = without_reception(profile)
+    profile = loops.beside_receivers(profile)
     profile, *sinks = _prepared((profile, *map(without_reception, sinks)), request)
     modes = request.modes
     if modes is not None and profile.of_modes and request.policy == "shaped":
@@ -150,7 +151,9 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
     plan = shaping.with_executors(plan, [output.executors for output in (profile, *sinks)])
     plan = plans.revised(plan, modes=modes, slot_ends=request.slot_ends)
     plan = shaping.with_turns(plan, request.equal_priorities)
+    plan = loops.with_loop(plan, profile, request)
     (plan,) = with_receivers_placed([plan], [profile])
+    plan = loops.with_thread_placed(plan, profile)
     return shaping.with_best_effort([plan], best_effort_cores([profile], request))[0]
 
 

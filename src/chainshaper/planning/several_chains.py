@@ -17,8 +17,8 @@ from typing import Any
 from chainshaper.planning.chain_plan import (
     PER_CALLBACK,
     ChainPlan,
-    Prediction,
     Server,
+    predicted_later,
     publishing_servers,
     revised,
     running_servers,
@@ -240,21 +240,9 @@ def _sharing_servers(plans: list[ChainPlan]) -> list[ChainPlan]:
         }
         moved = with_slots(gates, slots_of)
         taken += moved
-        predicted = _later(plan.predicted, by_ns)
+        predicted = predicted_later(plan.predicted, by_ns)
         changed.append(revised(plan, servers=(*shared.values(), *moved), predicted=predicted))
     return changed
-
-
-def _later(predicted: Prediction, later_ns: int) -> Prediction:
-    """Return the prediction for outputs that leave so much later."""
-    modes = {mode: _later(of_mode, later_ns) for mode, of_mode in (predicted.modes or {}).items()}
-    return predicted.model_copy(
-        update={
-            "mean_ns": predicted.mean_ns + later_ns,
-            "max_ns": predicted.max_ns + later_ns,
-            "modes": modes or None,
-        }
-    )
 
 
 def _fitting(
