@@ -287,7 +287,7 @@ class PlannedLoop(Part):
     # "loop": the loop's sleep is moved once, so that it starts the lead behind the slot's start.
     in_step: InStep | None = None
     # In step with "output", where the slot starts, earliest (behind L̄ + ε) and latest (so that it
-    # ends, and its gate is done, with the cycle): see :func:`chainshaper.planning.loop_ages.start_in_step`.
+    # ends, and its gate is done, with the cycle): see :func:`.loop_ages.start_in_step`.
     starts_ns: Range | None = None
     # How much later the output's slots are so that no instance starts while a message is stored.
     moved_ns: Duration = 0

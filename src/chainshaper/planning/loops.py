@@ -93,6 +93,51 @@ def step_of(wishes: Wishes) -> InStep | None:
     return "output" if wishes.in_step else "loop" if wishes.move_loop else None
 
 
+def one_before_another(
+    profiles: Sequence[Profile], wishes: Wishes, slots_ns: Sequence[int]
+) -> list[Profile]:
+    """Return profiles of chains whose outputs leave one before another for a loop that they share.
+
+    Of outputs in step that leave on one core, the first chain's leaves last. ``slots_ns`` are how
+    long their slots are.
+
+    Raises InputError: the loop is to be moved, which only one of its chains decides.
+    """
+    in_step = step_of(wishes)
+    taken: dict[tuple[str, str | None, int | None], int] = {}
+    first: dict[tuple[str, str | None], str] = {}
+    placed = []
+    for profile, slot_ns in zip(profiles, slots_ns, strict=True):
+        loop = profile.loop
+        if loop is None or in_step is None:
+            placed.append(profile)
+            continue
+        named = first.setdefault((loop.node, loop.thread), profile.name)
+        if in_step == "loop" and named != profile.name:
+            raise InputError(
+                f"--move-loop: {named} and {profile.name} both go into the loop of {loop.node},"
+                " which moves for one of them: put their slots in step (--in-step)"
+            )
+        where = (loop.node, loop.thread, profile.core_of.get(profile.last or ""))
+        before = taken.get(where, 0)
+        taken[where] = before + slot_ns
+        placed.append(replace(profile, loop=replace(loop, before_ns=before)))
+    return placed
+
+
+def at_other_offsets(plan: ChainPlan) -> ChainPlan:
+    """Return the plan of a chain that begins at another time than when it was recorded.
+
+    With what phase the loop starts behind it then is not known, unless one of the two is moved.
+    """
+    loop = plan.loop
+    if loop is None or loop.in_step is not None or loop.age_at_any_phase is None:
+        return plan
+    return plan.model_copy(
+        update={"loop": loop.model_copy(update={"age": loop.age_at_any_phase, "moved_ns": 0})}
+    )
+
+
 def stated(plan: ChainPlan) -> ChainPlan:
     """Return a plan whose loop states the ages that come of the plan's slots."""
     loop = plan.loop
@@ -164,7 +209,7 @@ def beside_receivers(profile: Profile) -> Profile:
         return profile
     reception = reception._replace(
         beside_ns=reception.beside_ns + loop.time_ns,
-        beside_once_ns=reception.beside_once_ns + loop.time_ns,
+        beside_once_ns=reception.beside_once_ns + loop.once_ns,
     )
     return replace(profile, reception=reception)
 
@@ -176,7 +221,7 @@ def _planned(plan: ChainPlan, loop: RecordedLoop, wishes: Wishes) -> PlannedLoop
         storing = loop.storing_ns
         delivery = (wishes.delivery_ns, wishes.delivery_ns + storing, wishes.delivery_ns + storing)
     exact_ns = GATE_NS if plan.shaping_node is not None else STOPPED_THREAD_NS
-    lead_ns = delivery[1] + max(exact_ns, -(-delivery[1] // _MARGIN))
+    lead_ns = delivery[1] + max(exact_ns, -(-delivery[1] // _MARGIN)) + loop.before_ns
     unknown = LoopAge(first_ns=(0, 0), every_ns=(0, 0), constant=False, uses=(0, 0))
     return PlannedLoop(
         chain=loop.chain,

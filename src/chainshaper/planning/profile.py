@@ -86,7 +86,10 @@ class RecordedLoop:
     * ``takes_itself``: whether the loop's thread takes the messages, so that no event says when
       they could have been taken.
     * ``core``: where its thread has to run; None: several, or not known.
-    * ``time_ns``: how long its instances take in a cycle of the chain, at most.
+    * ``time_ns``, ``once_ns``: how long its instances take in a cycle of the chain, and how long
+      one takes, at most.
+    * ``before_ns``: so much sooner, in step, the output has to leave, since outputs of other chains
+      leave then for the same loop.
     """
 
     chain: str
@@ -105,6 +108,8 @@ class RecordedLoop:
     core: int | None = None
     realtime_priority: int | None = None
     time_ns: int = 0
+    once_ns: int = 0
+    before_ns: int = 0
 
 
 @dataclass(frozen=True)

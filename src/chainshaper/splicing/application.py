@@ -149,11 +149,10 @@ def _placed(application: Application, plan: Plan) -> Application:
             gates = (shaping.fifo_priority for shaping in plan.shaping_nodes)
             raised = {"core": place.core, "priority": max(1, min(gates) - 1)}
             nodes[name] = _with_loop(nodes[name], raised)
-    for loop in (chain.loop for chain in plan.chains):
-        for name, node in application.nodes.items() if loop and loop.move_ns else ():
-            if loop.node == node_name(name) and node.loop is not None:
-                later = {"phase_ns": node.loop.phase_ns + loop.move_ns}
-                nodes[name] = _with_loop(nodes[name], later)
+    moved_ns = {chain.loop.node: chain.loop.move_ns for chain in plan.chains if chain.loop}
+    for name, node in application.nodes.items():
+        if node.loop is not None and (by_ns := moved_ns.get(node_name(name))):
+            nodes[name] = _with_loop(nodes[name], {"phase_ns": node.loop.phase_ns + by_ns})
     return application.model_copy(update={"nodes": nodes})
 
 

@@ -93,7 +93,9 @@ def recorded_loop(
         phase = phase_of(starts, begun, math.gcd(loop.period_ns, period_ns))
         measured |= phase._asdict()
     took = pl.coalesce("execution_ns", pl.col("end") - pl.col("start")).fill_null(0)
-    in_cycles = instances.group_by(pl.col("start") // period_ns).agg(took=took.sum())["took"]
+    in_cycles = instances.group_by(pl.col("start") // period_ns).agg(
+        together=took.sum(), longest=took.max()
+    )
     return RecordedLoop(
         chain=whole.chain.spec,
         node=loop.node,
@@ -105,7 +107,8 @@ def recorded_loop(
         thread=None if thread is None else thread.comm or None,
         core=thread.cores[0] if thread is not None and len(thread.cores) == 1 else None,
         realtime_priority=thread.priority if thread and realtime and not raised_by_us else None,
-        time_ns=int(in_cycles.max() or 0),  # type: ignore[arg-type]
+        time_ns=int(in_cycles["together"].max()),  # type: ignore[arg-type]
+        once_ns=int(in_cycles["longest"].max()),  # type: ignore[arg-type]
         **measured,  # type: ignore[arg-type]
     )
 
