@@ -67,7 +67,7 @@ def profile(
         every_node=(node, "/controller"),
         receivers=("/controller",),
         reception=Reception(1, 100 * US, 200 * US, 400 * US, 50 * US),
-        callbacks=(CallbackTimes(node, output, (), longest, longest, 0),),
+        callbacks=(CallbackTimes(node, 0, longest, longest, longest, publishes=output),),
         loop=loop,
     )
 
@@ -303,20 +303,23 @@ def test_a_message_that_the_loop_takes_itself_was_there_when_it_was_taken_soones
 def test_several_chains_into_a_loop_leave_for_it_one_before_another() -> None:
     """Branches of one timer, and chains of different ones."""
     second = replace(LOOP, topic="/other", chain="/scan../other..command")
-    branch = profile(second, spec="/scan../other", output="/other")
+    short = profile(longest=4 * MS)
+    branch = profile(second, spec="/scan../other", output="/other", longest=4 * MS)
     request = PlanRequest(epsilon_ns=MS, in_step=True)
-    plan, _ = plan_application([profile(), branch], request)
+    plan, _ = plan_application([short, branch], request)
     slots = [publish_slots(chain)[0] for chain in plan.chains]
     assert slots == [(13_500_000, 14_500_000), (12_500_000, 13_500_000)]
     assert [known(chain.loop).age.first_ns[0] for chain in plan.chains] == [14 * MS, 14 * MS]
     with pytest.raises(InputError, match="both go into the loop of /controller"):
-        plan_application([profile(), branch], PlanRequest(epsilon_ns=MS, move_loop=True))
+        plan_application([short, branch], PlanRequest(epsilon_ns=MS, move_loop=True))
     alone, _ = plan_application(
-        [profile(), profile(None, spec="/scan../other", output="/other")], request
+        [short, profile(None, spec="/scan../other", output="/other", longest=4 * MS)], request
     )
     assert [chain.loop is None for chain in alone.chains] == [False, True]
-    apart = profile(second, spec="/b../other", first="/b", output="/other", node="/b")
-    plan, _ = plan_application([profile(), apart], PlanRequest(epsilon_ns=MS))
+    apart = profile(
+        second, spec="/b../other", first="/b", output="/other", node="/b", longest=4 * MS
+    )
+    plan, _ = plan_application([short, apart], PlanRequest(epsilon_ns=MS))
     assert isinstance(plan, Plan)
     for chain in plan.chains:  # their offsets are not those of the recording
         loop = known(chain.loop)
