@@ -37,14 +37,21 @@ class DataAge:
     * ``age_at_end_ns``: how old it was when the chain's output left.
     * ``use``: 1 for the first cycle that used this message, 2 for the second, and so on.
 
+    ``messages`` has a row for each message that came: ``traversal``, ``stored`` (ns).
     ``uses`` counts messages: ``never`` used, used ``once``, and ``again`` (in more than one cycle).
     """
 
     loop: Callback
     topic: str
     cycles: pl.DataFrame
+    messages: pl.DataFrame
     uses: dict[str, int]
     most_uses: int
+
+    @property
+    def at_loop_ns(self) -> pl.Series:
+        """The age of the message (ns), when it was read, of each cycle that used one."""
+        return self.cycles.drop_nulls("traversal")["age_at_loop_ns"]
 
 
 def data_age(
@@ -115,7 +122,9 @@ def _ages_at(
         last = _NEVER if until is None else until
         cycles = cycles.filter(pl.col("start").is_between(since, last))
         messages = messages.filter(pl.col("stored").is_between(since, last))
-    return DataAge(loop, topic, cycles, *_uses(cycles, messages))
+    uses, most_uses = count_uses(cycles, messages)
+    came = messages.select("traversal", "stored")
+    return DataAge(loop, topic, cycles, came, uses, most_uses)
 
 
 def _ends(
@@ -136,8 +145,18 @@ def _ends(
     return outputs.select("publication", "instance").join(ends, on="instance").drop("instance")
 
 
-def _uses(cycles: pl.DataFrame, messages: pl.DataFrame) -> tuple[dict[str, int], int]:
-    """Count how often messages were used that came before the loop's last cycle; and the most."""
+def use_shares(uses: dict[str, int]) -> tuple[float | None, float | None]:
+    """Return the shares of messages that were never used, and used again; None: none came."""
+    count = sum(uses.values())
+    return (uses["never"] / count, uses["again"] / count) if count else (None, None)
+
+
+def count_uses(cycles: pl.DataFrame, messages: pl.DataFrame) -> tuple[dict[str, int], int]:
+    """Count how often messages were used that came before the loop's last cycle; and the most.
+
+    ``cycles`` has the columns ``start`` and ``traversal``, ``messages`` has ``traversal`` and
+    ``stored``.
+    """
     counts = cycles.drop_nulls("traversal").group_by("traversal").agg(uses=pl.len())
     last = cycles["start"].max()
     came = messages.filter(pl.col("stored") < pl.lit(last, pl.Int64)).select("traversal").unique()
