@@ -38,7 +38,7 @@ class Counted(CoreUse):
         super().__init__()
         self.used = {each.tid: each for each in used}
 
-    def between(self, since_ns: int, until_ns: int) -> tuple[int, dict[int, Used]]:
+    def between(self, since_ns: int, until_ns: int) -> tuple[int, dict[int, Used]]:  # noqa: ARG002
         return SECOND, self.used
 
 

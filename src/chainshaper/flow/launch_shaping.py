@@ -107,9 +107,9 @@ def shape_launch(
     get them by way of a throttler, from the first recording on. ``request.cores`` are where
     executors run (default: the last core, and others that are worth it). The application is
     launched briefly, and for ``duration_ns`` before and after. ``loops`` are names of nodes and
-    threads whose loops are recorded although they publish nothing (`preload` only). ``planned`` gets the
-    plan before it is used. ``stop`` ends everything. The rest is for :func:`.profile_chains` and
-    :func:`.apply_plan`.
+    threads whose loops are recorded although they publish nothing (`preload` only). ``planned``
+    gets the plan before it is used. ``stop`` ends everything. The rest is for
+    :func:`.profile_chains` and :func:`.apply_plan`.
 
     Raises InputError: ``folder`` is not empty, the command is not `ros2 launch`, or what it
     launches does not fit. PlatformError, OperationError: there is no such core, or a step failed;
