@@ -9,6 +9,7 @@ from story import Story
 
 from chainshaper.analysis import analyse_latency, callback_statistics, data_flow, graph_of
 from chainshaper.analysis.loops import thread_turns
+from chainshaper.values.event_declarations import SLEEPING_CALLS
 
 
 def latencies(story: Story, chain: str) -> list[tuple[int, int]]:
@@ -317,7 +318,7 @@ def test_a_loop_on_a_machine_that_stands_still_has_the_period_that_it_sleeps_by(
 
 
 def test_a_loop_that_leaves_out_periods_has_the_one_that_it_sleeps_by() -> None:
-    """As rates that overran begin anew: of the instants until which it sleeps most are 100 apart."""
+    """Rates that overran begin anew: of the instants until which it sleeps most are 100 apart."""
     story = Story()
     cmd = story.publisher(story.node("/actor", PID), "/cmd")
     first_sleep(story, 40, 100)
@@ -384,6 +385,33 @@ def test_a_loop_that_never_sleeps_for_a_time_is_paced_by_data() -> None:
     flow = data_flow(story.tables())
     assert flow.objects.callbacks.filter(handle=0)["kind"].to_list() == ["unknown"]
     assert any("paced by data" in note and str(LOOP) in note for note in flow.notes)
+
+
+UNTIMED = SLEEPING_CALLS.index("pthread_cond_wait")
+
+
+def test_waits_without_a_time_inside_a_publication_do_not_end_a_turn() -> None:
+    """The middleware waits for its own thread, twice in each turn of 50."""
+    story = loop_behind((0, 200), (100, 200, 300, 400))
+    for woke in (100, 200, 300, 400):
+        for at in (31, 35):
+            story.event("thread_sleep", woke + at, PID, LOOP, until=0, call=UNTIMED)
+            story.event("thread_wake", woke + at + 2, PID, LOOP, call=UNTIMED)
+    turns = thread_turns(story.tables())
+    assert turns.select("start", "end").rows() == [(w, w + 50) for w in (100, 200, 300, 400)]
+    assert row(story)["period_ns"] == 100
+
+
+def test_a_named_thread_that_waits_without_a_time_has_turns() -> None:
+    """Another thread signals it every 100."""
+    story = Story()
+    story.node("/manager", PID)
+    named(story, "worker", tid=LOOP, is_thread=1)
+    story.event("thread_sleep", 40, PID, LOOP, until=0, call=UNTIMED)
+    for woke in range(100, 1100, 100):
+        turn(story, woke, woke + 50, 0, call=UNTIMED)
+    loop = row(story, "/manager")
+    assert (loop["period_ns"], loop["count"], loop["start_jitter_ns"]) == (100, 10, None)
 
 
 def queueing(counts: tuple[int, ...]) -> Story:

@@ -56,8 +56,9 @@ def loop_instances(flow: DataFlow) -> pl.DataFrame:
     names = names.unique("callback_id", keep="first", maintain_order=True)
     topic = pl.col("topic").cast(pl.String)
     topics = flow.publications.select("callback_id", topic).drop_nulls()
-    topics = topics.filter(~topic.str.ends_with(LOOP_END)).group_by("callback_id")
-    names = names.join(topics.agg(publishes=topic.unique().sort()), on="callback_id", how="left")
+    topics = topics.filter(~topic.str.ends_with(LOOP_END))
+    published = topics.group_by("callback_id").agg(publishes=topic.unique().sort())
+    names = names.join(published, on="callback_id", how="left")
     rows = flow.instances.join(names, on="callback_id").join(flow.turns, on="instance", how="left")
     woke = events.table(flow.events, "thread_wake", ["cpu"]).select(
         "pid", "tid", "cpu", start="time"
@@ -114,7 +115,8 @@ def _rate(node: str, topics: tuple[str, ...], rows: pl.DataFrame) -> LoopRate:
         if (period := loop_period(of_thread["start"], of_thread["due"])) is not None
     ]
     late = (rows["start"] - rows["due"]).drop_nulls()
-    jitter = int(late.max() - late.min()) if len(late) else None  # type: ignore[operator, arg-type]
+    lateness = late.to_list()
+    jitter = max(lateness) - min(lateness) if lateness else None
     known = rows["overran"].count()
     return LoopRate(
         node=node,

@@ -4,7 +4,8 @@ ros2_control's update thread, a `rclcpp::Rate`, a `while` loop in Python: the la
 robots is no callback. The tracing library in front of ROS 2 records when such a thread goes to
 sleep and wakes up (`thread_sleep`, `thread_wake`).
 
-* **A turn** is what lies between two sleeps of a thread. It is an instance of the loop.
+* **A turn** is what lies between two sleeps of a thread. It is an instance of the loop. A wait
+  without a time (`pthread_cond_wait`) counts only in a thread that hardly sleeps otherwise.
 * **A loop** is a thread that publishes outside callbacks, or that the user named. One that
   publishes for several nodes is a loop of each. Topics that are never published in the same turn
   belong to different loops of one thread: each has the turns in which it published.
@@ -44,6 +45,8 @@ _EXACT = 0.01  # share of its period by which the instants until which a loop sl
 _CHOSEN = 0.5  # of these instants, more must be so exactly a period apart
 _FOR_A_TIME = [SLEEPING_CALLS.index(name) for name in ("clock_nanosleep", "nanosleep", "timerfd")]
 """Calls by which a thread can only sleep, not wait for something."""
+_UNTIMED = SLEEPING_CALLS.index("pthread_cond_wait")
+_ALONE = 0.1  # other sleeps of a thread, for each of its waits without a time
 
 
 @dataclass(frozen=True)
@@ -97,6 +100,11 @@ def thread_turns(tables: events.EventTables) -> pl.DataFrame:
     wakes = events.table(tables, "thread_wake", ["thread_time"]).filter(pl.col("call") != 0)
     wakes = wakes.select(*columns, until=pl.lit(None, pl.Int64), wakes=pl.lit(True))
     rows = pl.concat([sleeps, wakes]).sort(*_THREAD, "time", "wakes", maintain_order=True)
+    # Middlewares wait without a time inside a publication, too. So such waits are between turns
+    # only in a thread that hardly sleeps otherwise.
+    untimed = (pl.col("call") == _UNTIMED).fill_null(False)
+    others = (~untimed & ~pl.col("wakes")).sum().over(_THREAD)
+    rows = rows.filter(~untimed | (others <= _ALONE * untimed.sum().over(_THREAD)))
 
     def beside(column: str, places: int) -> pl.Expr:
         """Return the column of the thread's sleep before (1) or after (-1) a row."""

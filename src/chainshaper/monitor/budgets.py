@@ -513,11 +513,11 @@ def _judged_age(
         ("never used", limits.never, never),
         ("used again", limits.again, again),
     ]
-    for figure, limit, measured in judged:
-        if limit is not None:
+    for figure, most, measured in judged:
+        if most is not None:
             because, where = reason if measured is None else None, f"{chain.chain} at its loop"
             at_least = figure == "lowest age"
-            yield Judged(name, where, figure, limit, measured, None, because, at_least)
+            yield Judged(name, where, figure, most, measured, None, because, at_least)
 
 
 def _judged_loops(
