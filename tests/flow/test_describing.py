@@ -216,15 +216,14 @@ def test_a_loop_is_described_as_one_and_its_latency_and_ages_come_out_again(
     (loop,) = (c for c in described.nodes["controller"].callbacks if c.loop_ns is not None)
     assert (loop.loop_ns, loop.reads) == (10_000_000, ("/command",))
     again = simulate(described, tmp_path / "again", cycles=100)
-    ages = []
+    figures = list[tuple[Any, ...]]()
     for measured in (recording, again):
         analysis = analyse_latency(measured, measured.info.chain or "")
-        age = analysis.data_age
+        age, latencies = analysis.data_age, analysis.statistics
         assert age is not None
-        ages.append((age.uses, age.at_loop_ns.mean(), age.at_loop_ns.max()))
-        latencies = analysis.statistics
-        ages[-1] += (latencies.mean_ns, latencies.max_ns)
-    recorded, simulated = ages
+        of_ages = (age.at_loop_ns.mean(), age.at_loop_ns.max())
+        figures.append((age.uses, *of_ages, latencies.mean_ns, latencies.max_ns))
+    recorded, simulated = figures
     assert simulated[0] == recorded[0]
     assert simulated[1:] == pytest.approx(recorded[1:], rel=0.02)
 

@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import polars as pl
 
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.loops import loop_period
 from chainshaper.values import events
 from chainshaper.values.application import LOOP_END
+from chainshaper.values.durations import duration_text
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,19 @@ class LoopRate:
     shows how it sleeps."""
     overruns: int | None
     """Instances that ended when the next one should have begun; None: not known."""
+    apart_ns: tuple[int, int, int] | None = None
+    """How far apart starts are: 5th, 50th and 95th percentile; None: less than three."""
+
+    @property
+    def irregular(self) -> str:
+        """Why it has no period, in words."""
+        if self.apart_ns is None:
+            return "it had fewer than three instances: it has no period"
+        low, usual, high = map(duration_text, self.apart_ns)
+        return (
+            f"it sleeps irregularly, usually {usual} lie between its starts, from {low} (p5) to"
+            f" {high} (p95): it has no period"
+        )
 
     @property
     def overrun_share(self) -> float | None:
@@ -126,4 +141,14 @@ def _rate(node: str, topics: tuple[str, ...], rows: pl.DataFrame) -> LoopRate:
         period_ns=max(periods, default=None),
         start_jitter_ns=jitter,
         overruns=int(rows["overran"].sum()) if known else None,
+        apart_ns=_apart(rows),
     )
+
+
+def _apart(rows: pl.DataFrame) -> tuple[int, int, int] | None:
+    """Return percentiles of the distances of starts in each thread (ns)."""
+    apart = rows.select(pl.col("start").diff().over("pid", "tid")).drop_nulls().to_series()
+    if len(apart) < 2:
+        return None
+    low, usual, high = (round(float(v)) for v in np.percentile(apart.to_numpy(), (5, 50, 95)))
+    return low, usual, high

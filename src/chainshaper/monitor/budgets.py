@@ -530,7 +530,7 @@ def _judged_loops(
             f"the recording has no such loop: {_loops_text(rates)}; a loop that publishes nothing"
             " is recorded with --loop, and one that is paced by data is none"
         )
-        irregular = "it sleeps irregularly, or had fewer than three instances: it has no period"
+        irregular = next((rate.irregular for rate in here if rate.period_ns is None), "")
         unseen = "no event shows how it sleeps: record with `--source preload`"
         limits: list[tuple[str, float | None, list[float | None], str]] = [
             ("shortest period", loop.shortest_period_ns, [r.period_ns for r in here], irregular),

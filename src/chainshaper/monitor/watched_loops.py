@@ -116,6 +116,8 @@ class WatchedLoops:
         for rate in self._known.values():
             now = next((each for each in minute if _is_same(each, rate)), None)
             problem = None if now else "no instance in the last minute"
+            if now and now.period_ns is None and now.apart_ns is not None:
+                problem = now.irregular
             misses = sum(label == rate.label for _, label in self._misses)
             stopped = LoopRate(rate.node, rate.publishes, rate.tids, 0, None, None, None)
             shown.append(LoopNow(rate.label, now or stopped, misses, problem))
