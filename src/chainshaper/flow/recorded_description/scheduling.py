@@ -74,7 +74,9 @@ def _add_loops(evidence: Evidence, nodes: Mapping[str, DescribedNode], free: Ite
         name: _threads(evidence, [] if node.loop is None else node.loop.ids)
         for name, node in looping.items()
     }
+    said = len(evidence.notes)
     priorities = _priorities(evidence, threads) if threads else {}
+    del evidence.notes[said:]  # of their nodes' executors the same was said
     for name, node in looping.items():
         if node.loop is None or {*threads[name]} <= {*_threads(evidence, node.of_executor)}:
             continue
