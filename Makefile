@@ -87,7 +87,8 @@ lint: .venv/.ready-dev
 	nice -n 19 .venv/bin/lint-imports --no-cache
 	.venv/bin/clang-format --dry-run --Werror $(core) $(nodes)
 	nice -n 19 .venv/bin/clang-tidy --quiet -p $(built) \
-		$(filter-out core/tests/% core/fuzz/%,$(filter %.cpp,$(core))) $(filter %.cpp,$(in_front_of_rmw))
+		$(filter-out core/tests/% core/fuzz/%,$(filter %.cpp,$(core))) $(filter %.cpp,$(in_front_of_rmw)) \
+		src/chainshaper/sources/preload/preload.c
 	nice -n 19 scripts/lint-nodes .venv/bin/clang-tidy $(built)preloaded/include
 
 # Needs a quiet machine and about a quarter of an hour; prints tables, asserts nothing.

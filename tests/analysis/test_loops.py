@@ -9,6 +9,7 @@ from story import Story
 
 from chainshaper.analysis import analyse_latency, callback_statistics, data_flow, graph_of
 from chainshaper.analysis.loops import thread_turns
+from chainshaper.values.event_declarations import SLEEPING_CALLS
 
 
 def latencies(story: Story, chain: str) -> list[tuple[int, int]]:
@@ -206,6 +207,37 @@ def test_the_age_of_what_a_loop_uses_is_known_for_each_of_its_cycles() -> None:
     assert (age.uses, age.most_uses) == ({"never": 1, "once": 0, "again": 2}, 2)
 
 
+def test_where_a_message_is_stored_while_the_loop_is_awake_the_cycle_is_ambiguous() -> None:
+    """The callback runs for 2, from 10 behind its input; a turn from 100, 200, … publishes at 30.
+
+    It may store its message behind the wake-up of the turn that it began before (at 99), within the
+    turn (at 210 and at 329), or behind the publication (at 431).
+    """
+    story = loop_behind((89, 200, 319, 421), (100, 200, 300, 400, 500))
+    age = analyse_latency(data_flow(story.tables()), "/a../cmd").data_age
+    assert age is not None
+    assert age.cycles.select("start", "ambiguous").rows() == [
+        (100, True),
+        (200, True),
+        (300, True),
+        (400, False),
+        (500, False),
+    ]
+    assert age.ambiguous == 3
+
+
+def test_what_the_loop_takes_itself_makes_no_cycle_ambiguous() -> None:
+    age = analyse_latency(data_flow(python_loop(sleeps=True).tables()), "/a../cmd").data_age
+    assert age is not None and age.ambiguous == 0
+
+
+def test_without_events_of_sleeps_it_is_not_known_which_cycles_are_ambiguous() -> None:
+    story = loop_behind(tuple(range(0, 2000, 200)), tuple(range(100, 2100, 100)))
+    tables = {name: t for name, t in story.tables().items() if not name.startswith("thread_")}
+    age = analyse_latency(data_flow(tables), "/a../cmd").data_age
+    assert age is None or age.ambiguous is None
+
+
 def test_the_age_at_the_end_is_that_of_the_output_behind_the_loop() -> None:
     """/out reads each command 5 behind it and publishes 3 later."""
     story = loop_behind((0,), (100, 200))
@@ -271,6 +303,31 @@ def test_a_thread_that_sleeps_irregularly_has_no_period_and_its_spread_is_said()
     assert "usually" in note and "(p95)" in note and "nothing is to be planned" in note
 
 
+def test_a_loop_on_a_machine_that_stands_still_has_the_period_that_it_sleeps_by() -> None:
+    """Two of three starts are late, by 40 to 90 of 100; it sleeps until multiples of 100."""
+    story = Story()
+    cmd = story.publisher(story.node("/actor", PID), "/cmd")
+    first_sleep(story, 40, 100)
+    for due in range(100, 3100, 100):
+        woke = due + (0 if due % 300 == 0 else 40 + due // 100 * 17 % 50)
+        turn(story, woke, woke + 5, due + 100, writes=((cmd, woke + 2),))
+    starts = data_flow(story.tables()).instances["start"].sort().diff().drop_nulls()
+    assert (starts.is_between(90, 110)).mean() < 0.5
+    assert row(story)["period_ns"] == 100
+    assert not any("irregularly" in note for note in data_flow(story.tables()).notes)
+
+
+def test_a_loop_that_leaves_out_periods_has_the_one_that_it_sleeps_by() -> None:
+    """Rates that overran begin anew: of the instants until which it sleeps most are 100 apart."""
+    story = Story()
+    cmd = story.publisher(story.node("/actor", PID), "/cmd")
+    first_sleep(story, 40, 100)
+    dues = [100, 200, 300, 537, 637, 737, 990, 1090, 1190, 1290, 1655, 1755, 1855]
+    for due, following in zip(dues, [*dues[1:], 1955], strict=True):
+        turn(story, due + 1, due + 50, following, writes=((cmd, due + 2),))
+    assert row(story)["period_ns"] == 100
+
+
 def test_a_loop_that_is_woken_before_its_time_is_paced_by_data() -> None:
     story = Story()
     node = story.node("/driver", PID)
@@ -328,6 +385,33 @@ def test_a_loop_that_never_sleeps_for_a_time_is_paced_by_data() -> None:
     flow = data_flow(story.tables())
     assert flow.objects.callbacks.filter(handle=0)["kind"].to_list() == ["unknown"]
     assert any("paced by data" in note and str(LOOP) in note for note in flow.notes)
+
+
+UNTIMED = SLEEPING_CALLS.index("pthread_cond_wait")
+
+
+def test_waits_without_a_time_inside_a_publication_do_not_end_a_turn() -> None:
+    """The middleware waits for its own thread, twice in each turn of 50."""
+    story = loop_behind((0, 200), (100, 200, 300, 400))
+    for woke in (100, 200, 300, 400):
+        for at in (31, 35):
+            story.event("thread_sleep", woke + at, PID, LOOP, until=0, call=UNTIMED)
+            story.event("thread_wake", woke + at + 2, PID, LOOP, call=UNTIMED)
+    turns = thread_turns(story.tables())
+    assert turns.select("start", "end").rows() == [(w, w + 50) for w in (100, 200, 300, 400)]
+    assert row(story)["period_ns"] == 100
+
+
+def test_a_named_thread_that_waits_without_a_time_has_turns() -> None:
+    """Another thread signals it every 100."""
+    story = Story()
+    story.node("/manager", PID)
+    named(story, "worker", tid=LOOP, is_thread=1)
+    story.event("thread_sleep", 40, PID, LOOP, until=0, call=UNTIMED)
+    for woke in range(100, 1100, 100):
+        turn(story, woke, woke + 50, 0, call=UNTIMED)
+    loop = row(story, "/manager")
+    assert (loop["period_ns"], loop["count"], loop["start_jitter_ns"]) == (100, 10, None)
 
 
 def queueing(counts: tuple[int, ...]) -> Story:

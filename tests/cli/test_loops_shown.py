@@ -64,10 +64,59 @@ def test_the_report_has_the_age_of_the_loops_data(recording: Path, tmp_path: Pat
     assert "Age of the data" in page.read_text()
 
 
+def command_for(verb: str, folder: Path) -> tuple[str, ...]:
+    """A command that a verb starts; `shape` takes launch files alone."""
+    (folder / "a.launch.py").write_text("")
+    return ("ros2", "launch", str(folder / "a.launch.py")) if verb == "shape" else ("true",)
+
+
 @pytest.mark.parametrize("source", ["ebpf", "lttng"])
-def test_a_loop_is_named_for_the_library_in_front_only(tmp_path: Path, source: str) -> None:
-    words = ("record", "-o", tmp_path / "r", "--source", source, "--loop", "/a", "--", "true")
-    assert "leave out --loop" in refused(2, *words)
+@pytest.mark.parametrize("verb", ["record", "profile", "shape"])
+def test_a_loop_is_named_for_the_library_in_front_only(
+    tmp_path: Path, verb: str, source: str
+) -> None:
+    words = (verb, "-o", tmp_path / "r", "--source", source, "--loop", "/a", "--")
+    said = refused(2, *words, *command_for(verb, tmp_path))
+    assert f"--source {source} does not see how threads sleep" in said
+    assert "leave out --loop" in said
+
+
+@pytest.mark.parametrize("verb", ["record", "profile", "shape", "watch"])
+def test_a_name_that_no_loop_can_have_is_refused_before_anything_starts(
+    tmp_path: Path, verb: str
+) -> None:
+    command = command_for(verb, tmp_path)
+    output = () if verb == "watch" else ("-o", tmp_path / "r")
+    for name, reason in (("/a b", "names no loop"), ("a_name_of_18_bytes", "no thread")):
+        assert reason in refused(2, verb, *output, "--loop", name, "--", *command)
+
+
+def test_verbs_that_name_no_loops_say_where_they_are_named(recording: Path) -> None:
+    for verb in ("latency", "callbacks", "plan"):
+        said = refused(2, verb, recording, "--loop", "/actor")
+        assert "loops are named where their sleeps are recorded" in said
+
+
+def test_a_described_application_has_its_loops_in_its_description(tmp_path: Path) -> None:
+    app, plan = tmp_path / "app.yaml", tmp_path / "plan.yaml"
+    assert called("init", "-o", app).code == 0
+    latencies = tmp_path / "latencies"
+    latencies.write_text("10ms\n11ms\n12ms\n" * 20)
+    planned = called("plan", "--latencies", latencies, "--period", "100ms", "-o", plan)
+    assert planned.code == 0, planned.err
+    said = refused(2, "shape", app, plan, "-o", tmp_path / "r", "--loop", "/actor")
+    assert "those of its description" in said and "leave out --loop" in said
+
+
+def test_an_end_that_is_not_there_says_how_to_get_it(recording: Path) -> None:
+    for verb in ("latency", "plan", "describe"):
+        output = ("-o", recording.parent / "described.yaml") if verb == "describe" else ()
+        said = refused(2, verb, recording, "--chain", "/a../actor:end", *output)
+        assert "/actor has no loop that was named" in said
+        assert "chainshaper record --loop /actor" in said
+        assert "end the chain with what its loop publishes: /cmd" in said
+    said = refused(2, "latency", recording, "--chain", "/a../aktor:end")
+    assert "no node is called /aktor" in said and "/actor" in said
 
 
 def test_plan_states_the_age_at_the_loop_and_puts_the_slot_before_it(

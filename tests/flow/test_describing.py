@@ -1,5 +1,7 @@
 """Descriptions of recordings: what they say, and that they simulate to the same latencies."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,8 +14,7 @@ from chainshaper.analysis import analyse_latency
 from chainshaper.flow.describing import application_file
 from chainshaper.simulation import simulate
 from chainshaper.sources import open_source
-from chainshaper.values.errors import InputError
-from chainshaper.values.recording import Recording
+from chainshaper.values.recording import Recording, open_recording
 from chainshaper.workload.description import Application, load_application
 
 ROBOT = """
@@ -191,12 +192,54 @@ nodes:
 """
 
 
-def test_a_chain_that_ends_with_a_loop_is_described_up_to_what_the_loop_reads(
-    tmp_path: Path,
+LOOPS = {  # what its loop publishes, and the chain
+    "silent": ("", "/scan../controller"),
+    "publishing": (", publishes: [/drive]", "/scan../drive"),
+    "read by others": (", publishes: [/drive]", "/scan../wheels"),
+}
+WHEELS = """
+  motor:
+    callbacks:
+      - {subscription: /drive, execution: {constant: 300us}, publishes: [/wheels]}
+"""
+
+
+@pytest.mark.parametrize(("publishes", "chain"), LOOPS.values(), ids=LOOPS)
+def test_a_loop_is_described_as_one_and_its_latency_and_ages_come_out_again(
+    tmp_path: Path, publishes: str, chain: str
 ) -> None:
-    (tmp_path / "app.yaml").write_text(LOOP)
-    recording = simulate(load_application(tmp_path / "app.yaml"), tmp_path / "recording", cycles=20)
-    with pytest.raises(InputError, match=r"ends with an instance of a loop.*add the loop by hand"):
-        application_file(recording)
+    text = LOOP.replace("{constant: 1ms}}]}", "{uniform: [1ms, 2ms]}" + publishes + "}]}")
+    text = text.replace("/scan../controller", chain) + (WHEELS if "wheels" in chain else "")
+    (tmp_path / "app.yaml").write_text(text)
+    recording = simulate(load_application(tmp_path / "app.yaml"), tmp_path / "r", cycles=100)
+    described = _described(recording, tmp_path)
+    (loop,) = (c for c in described.nodes["controller"].callbacks if c.loop_ns is not None)
+    assert (loop.loop_ns, loop.reads) == (10_000_000, ("/command",))
+    again = simulate(described, tmp_path / "again", cycles=100)
+    figures = list[tuple[Any, ...]]()
+    for measured in (recording, again):
+        analysis = analyse_latency(measured, measured.info.chain or "")
+        age, latencies = analysis.data_age, analysis.statistics
+        assert age is not None
+        of_ages = (age.at_loop_ns.mean(), age.at_loop_ns.max())
+        figures.append((age.uses, *of_ages, latencies.mean_ns, latencies.max_ns))
+    recorded, simulated = figures
+    assert simulated[0] == recorded[0]
+    assert simulated[1:] == pytest.approx(recorded[1:], rel=0.02)
+
+
+def test_the_example_of_a_loop_is_described_as_one(tmp_path: Path) -> None:
+    """Its subscription has a process with the loop, whose thread is another one."""
+    example = Path(__file__).parents[2] / "examples/write_loop.py"
+    subprocess.run([sys.executable, str(example), str(tmp_path / "r")], check=True)
+    recording = open_recording(tmp_path / "r")
     described = _described(recording, tmp_path, "/scan../command")
-    assert described.nodes.keys() == {"lidar", "planner", "controller"}
+    (loop,) = described.nodes["controller"].callbacks
+    assert (loop.loop_ns, loop.reads, loop.publishes) == (10_000_000, ("/scan",), ("/command",))
+    again = simulate(described, tmp_path / "again", cycles=200)
+    figures = []
+    for measured in (recording, again):
+        analysis = analyse_latency(measured, "/scan../command")
+        assert analysis.data_age is not None
+        figures.append((analysis.statistics.mean_ns, analysis.data_age.at_loop_ns.mean()))
+    assert figures[1] == pytest.approx(figures[0], rel=0.02)

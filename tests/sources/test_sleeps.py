@@ -9,6 +9,7 @@ import polars as pl
 import pytest
 from traced_program import Traced, traced
 
+from chainshaper.analysis.loops import thread_turns
 from chainshaper.sources.preload import PreloadTracer, named_loops
 from chainshaper.values.errors import InputError
 from chainshaper.values.event_declarations import SLEEPING_CALLS
@@ -48,7 +49,25 @@ static struct timespec later(clockid_t clock, long ns) {
 }
 static pthread_mutex_t mutex = PTHREAD_MUTEX_INITIALIZER;
 static pthread_cond_t of_wall_clock = PTHREAD_COND_INITIALIZER, of_steady_clock;
+static pthread_cond_t signalled = PTHREAD_COND_INITIALIZER;
 static int timer, waiting;
+static void *signals_again_and_again(void *unused) {
+  for (;;) {
+    nanosleep(&(struct timespec){0, 2000000}, NULL);
+    pthread_mutex_lock(&mutex);
+    pthread_cond_signal(&signalled);
+    pthread_mutex_unlock(&mutex);
+  }
+  return unused;
+}
+// A callback that is announced deep on the stack, and whose end is not.
+static __attribute__((noinline)) void throws(int depth) {
+  volatile char frame[512];
+  frame[0] = (char)depth;
+  if (depth) throws(depth - 1);
+  else emit("ros_trace_callback_start", 7, 0, 0, 0);
+  frame[1] = frame[0];
+}
 int rmw_wait(void *, void *, void *, void *, void *, void *, const uint64_t *);
 
 static void rest(const char *by) {
@@ -72,6 +91,7 @@ static void rest(const char *by) {
   pthread_mutex_lock(&mutex);
   if (!strcmp(by, "timedwait")) pthread_cond_timedwait(&of_wall_clock, &mutex, &wall);
   if (!strcmp(by, "steady")) pthread_cond_timedwait(&of_steady_clock, &mutex, &monotonic);
+  if (!strcmp(by, "for ever")) pthread_cond_wait(&signalled, &mutex);
   if (!strcmp(by, "clockwait"))
     pthread_cond_clockwait(&of_wall_clock, &mutex, CLOCK_MONOTONIC, &monotonic);
   pthread_mutex_unlock(&mutex);
@@ -79,7 +99,9 @@ static void rest(const char *by) {
 static void *loop(void *by_and_what) {
   const char **words = by_and_what;
   for (int turn = 0; turn < 20; turn++) {
+    if (strstr(words[1], "throws")) throws(3);
     if (strstr(words[1], "callback")) emit("ros_trace_callback_start", 7, 0, 0, 0);
+    if (strstr(words[1], "within")) throws(3);
     if (strstr(words[1], "publish")) emit("ros_trace_rcl_publish", 0x50, 1, 0, 0);
     if (strstr(words[1], "log")) emit("ros_trace_rcl_publish", 0x60, 1, 0, 0);
     rest(words[0]);
@@ -99,6 +121,9 @@ int main(int count, const char **words) {
   emit("ros_trace_rcl_node_init", 1, 2, (uintptr_t)"actor", (uintptr_t)"/robot");
   emit("ros_trace_rcl_publisher_init", 0x60, 1, 3, (uintptr_t)"/rosout");
   emit("ros_trace_rcl_take", 1, 0, 0, 0);
+  pthread_t signalling;
+  if (!strcmp(words[1], "for ever"))
+    pthread_create(&signalling, NULL, signals_again_and_again, NULL);
   for (int word = 1; word + 1 < count; word += 2) {
     pthread_t thread;
     pthread_create(&thread, NULL, loop, &words[word]);
@@ -332,9 +357,37 @@ def test_the_first_publication_outside_callbacks_says_that_the_thread_is_followe
     assert first["time"] <= tables["rcl_publish"]["time"][0]
 
 
-@pytest.mark.parametrize("what", ["nothing", "log", "callback publish"])
+def test_a_wait_without_a_time_is_seen_where_nothing_else_paces_the_thread(
+    program: Path, tmp_path: Path
+) -> None:
+    """It says no time; another thread signals the condition every 2 ms."""
+    for what, loops in (("publish", ()), ("nothing!", ("named",))):
+        folder = tmp_path / what
+        folder.mkdir()
+        traced_run = run(program, folder, "for ever", what, loops=loops)
+        slept = sleeps(traced_run)
+        assert set(slept["call"]) == {SLEEPING_CALLS.index("pthread_cond_wait")}
+        assert slept.height >= TURNS - 2, "a thread gets its name while it runs"
+        assert (slept["until"] == 0).all()
+        assert thread_turns(traced_run.tables)["due"].null_count() == slept.height
+    without = run(program, tmp_path, "for ever", "nothing", loops=("/robot/actor",)).tables
+    of_threads = without.get("thread_sleep", pl.DataFrame({"call": []}))
+    assert SLEEPING_CALLS.index("pthread_cond_wait") not in of_threads["call"]
+
+
+def test_a_callback_whose_end_never_comes_does_not_hide_the_loop_behind_it(
+    program: Path, tmp_path: Path
+) -> None:
+    """It threw an exception, and the loop around its executor went on."""
+    assert sleeps(run(program, tmp_path, "absolute", "throws publish")).height == TURNS
+
+
+@pytest.mark.parametrize("what", ["nothing", "log", "callback publish", "callback within publish"])
 def test_threads_that_are_no_loops_are_left_alone(program: Path, tmp_path: Path, what: str) -> None:
-    """Those that only log, and those whose callbacks publish and sleep."""
+    """Those that only log, and those whose callbacks publish and sleep.
+
+    Also within a callback in which another one ended without a word.
+    """
     tables = run(program, tmp_path, "absolute", what).tables
     assert not {"thread_sleep", "thread_wake", "loop_named"} & tables.keys()
 

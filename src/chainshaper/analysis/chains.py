@@ -16,7 +16,7 @@ vertices: exact without cycles, else a bound.
 """
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from itertools import pairwise
@@ -24,6 +24,7 @@ from typing import TypeAlias, TypeVar
 
 from chainshaper.values.application import (
     INTERNAL_TOPICS,
+    LOOP_END,
     REQUEST,
     RESPONSE,
     ApplicationGraph,
@@ -297,11 +298,35 @@ class _Search:
         if not topics:
             problem = "the recording shows no topics at all; tracing has to start before the"
             raise self.wrong(f"{problem} application does")
+        if name.endswith(LOOP_END):
+            raise self._without_end(name.removesuffix(LOOP_END), nodes.keys())
         hint = f"the names there are: {_some(topics - INTERNAL_TOPICS or topics)};"
         hint += " `chainshaper graph` shows all of them"
         if close := close_names(name, topics | nodes.keys()):
             hint = f"did you mean {' or '.join(close)}?"
         raise self.wrong(f"no topic or node is called {name}; {hint}")
+
+    def _without_end(self, name: str, nodes: Collection[str]) -> InputError:
+        """Make an error that says why there is no end of a loop, NODE:end."""
+        node = name if name in nodes else f"/{name}"
+        if node not in nodes:
+            close = close_names(name, nodes)
+            hint = (
+                f"did you mean {' or '.join(close)}?" if close else "`chainshaper graph` shows all"
+            )
+            return self.wrong(f"no node is called {name}, whose loop has an end; {hint}")
+        loops = [c for c in self.graph.callbacks if c.kind == "loop" and c.node == node]
+        wrote = sorted({topic for loop in loops for topic in loop.publishes})
+        of_node = f"{node} has no loop that was named, or that was seen to sleep"
+        instead = (
+            f"; or end the chain with what its loop publishes: {_some(wrote)}" if wrote else ""
+        )
+        return self.wrong(
+            f"{of_node}: only the instances of a named loop have an end. Name it where it is"
+            f" recorded, by its node or its thread's name: `chainshaper record --loop {node}`."
+            " A loop that is paced by data or by another thread is named by its thread, and the"
+            f" notes of `chainshaper info` say which named ones were not seen{instead}"
+        )
 
     def _in_process(self, node: str, callbacks: Iterable[int], process: str) -> frozenset[Vertex]:
         """Select those of a node's callbacks that ran in a process."""

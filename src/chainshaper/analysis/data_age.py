@@ -9,6 +9,13 @@ does.
 Which message that is, the traversals say (:mod:`~chainshaper.analysis.traversals`): the newest that
 was stored before the turn began, or that the loop took itself in this turn. That the newest one
 wins is an inference, unless the loop evidently queues its messages.
+
+Two instants are not known: when a callback stores its message, between its start and its end, and
+when the loop reads it, between its wake-up and its output. Mostly a loop reads at once. But a lock,
+or another thread on its core, may hold it up behind its wake-up; then it reads what was stored
+meanwhile. And a callback may have stored its message, or not yet, as the loop wakes up. So where
+both overlap the cycle is **ambiguous**: which message it used cannot be told, only that it was this
+one or the one before. A message counts as stored at the start of its callback.
 """
 
 from dataclasses import dataclass
@@ -37,15 +44,30 @@ class DataAge:
     * ``age_at_loop_ns``: how old the message was when the loop read it.
     * ``age_at_end_ns``: how old it was when the chain's output left.
     * ``use``: 1 for the first cycle that used this message, 2 for the second, and so on.
+    * ``ambiguous``: whether another thread's callback may have stored a message between the loop's
+      wake-up and its output (null: when it woke up is not known).
 
+    ``messages`` has a row for each message that came: ``traversal``, ``stored`` (ns).
     ``uses`` counts messages: ``never`` used, used ``once``, and ``again`` (in more than one cycle).
     """
 
     loop: Callback
     topic: str
     cycles: pl.DataFrame
+    messages: pl.DataFrame
     uses: dict[str, int]
     most_uses: int
+
+    @property
+    def ambiguous(self) -> int | None:
+        """In how many cycles it cannot be told which message was used; None: not known."""
+        known = self.cycles["ambiguous"].drop_nulls()
+        return int(known.sum()) if len(known) or self.cycles.is_empty() else None
+
+    @property
+    def at_loop_ns(self) -> pl.Series:
+        """The age of the message (ns), when it was read, of each cycle that used one."""
+        return self.cycles.drop_nulls("traversal")["age_at_loop_ns"]
 
 
 def data_age(
@@ -100,15 +122,16 @@ def _ages_at(
     topic = traversals.chain.topics[hop]
     begun = traversals.frame.select("traversal", begun="start")
     messages = traversals.hops.filter(pl.col("hop") == hop)
-    messages = messages.select("traversal", "publication", stored="start")
+    messages = messages.select("traversal", "publication", "instance", stored="start")
     messages = messages.join(begun, on="traversal", maintain_order="left")
     outputs = flow.publications.filter(
         pl.col("instance").is_not_null(), callback_id=loop.id, topic=topic
     ).select("publication", "instance", "time", publish="sent")
     start = pl.lit(flow.instances["start"]).gather("instance")
     outputs = outputs.with_columns(start=start).sort("time", maintain_order=True)
+    outputs = outputs.with_columns(ambiguous=_ambiguous(flow, outputs, messages["instance"]))
     # What is published without a new message repeats the one before.
-    first_uses = messages.drop_nulls("publication")
+    first_uses = messages.drop("instance").drop_nulls("publication")
     used = outputs.join(first_uses, on="publication", how="left", maintain_order="left")
     used = used.with_columns(pl.col("traversal", "stored", "begun").forward_fill())
     used = used.join(
@@ -128,13 +151,46 @@ def _ages_at(
         use=pl.when(pl.col("traversal").is_not_null()).then(
             pl.int_range(1, pl.len() + 1).over("traversal")
         ),
+        ambiguous="ambiguous",
     )
     if between is not None:
         since, until = between
         last = _NEVER if until is None else until
         cycles = cycles.filter(pl.col("start").is_between(since, last))
         messages = messages.filter(pl.col("stored").is_between(since, last))
-    return DataAge(loop, topic, cycles, *_uses(cycles, messages))
+    uses, most_uses = count_uses(cycles, messages)
+    came = messages.select("traversal", "stored")
+    return DataAge(loop, topic, cycles, came, uses, most_uses)
+
+
+def _ambiguous(flow: DataFlow, outputs: pl.DataFrame, storing: pl.Series) -> pl.Series:
+    """Say of each output of a loop whether a message may have been stored while it was made.
+
+    ``storing`` are the instances of the callback that stores. Those on the loop's own thread are
+    left out: it takes messages itself, before or behind its publication.
+    """
+    columns = flow.instances.select("tid", "start", "end")
+    stored = columns[storing.drop_nulls().unique()].sort("start")
+    turns = outputs.select("time", row=pl.int_range(pl.len()), instance="instance")
+    turns = turns.hstack(columns[outputs["instance"]].rename({"start": "woke", "end": "slept"}))
+    parts = []
+    for of_thread in turns.partition_by("tid"):
+        others = stored.filter(pl.col("tid") != of_thread["tid"][0])
+        ends = others.select(pl.coalesce("end", "start").cum_max()).to_series()
+        before = others["start"].search_sorted(of_thread["time"], side="left").cast(pl.Int64) - 1
+        last = pl.when(before >= 0).then(pl.lit(ends).gather(before.clip(0))) if len(ends) else None
+        over = pl.lit(None, pl.Int64) if last is None else last
+        parts.append(
+            of_thread.select(
+                "row",
+                ambiguous=pl.when(pl.col("slept").is_not_null()).then(
+                    (over > pl.col("woke")).fill_null(False)
+                ),
+            )
+        )
+    if not parts:
+        return pl.Series("ambiguous", [], pl.Boolean)
+    return pl.concat(parts).sort("row")["ambiguous"]
 
 
 def _ends(
@@ -155,8 +211,18 @@ def _ends(
     return outputs.select("publication", "instance").join(ends, on="instance").drop("instance")
 
 
-def _uses(cycles: pl.DataFrame, messages: pl.DataFrame) -> tuple[dict[str, int], int]:
-    """Count how often messages were used that came before the loop's last cycle; and the most."""
+def use_shares(uses: dict[str, int]) -> tuple[float | None, float | None]:
+    """Return the shares of messages that were never used, and used again; None: none came."""
+    count = sum(uses.values())
+    return (uses["never"] / count, uses["again"] / count) if count else (None, None)
+
+
+def count_uses(cycles: pl.DataFrame, messages: pl.DataFrame) -> tuple[dict[str, int], int]:
+    """Count how often messages were used that came before the loop's last cycle; and the most.
+
+    ``cycles`` has the columns ``start`` and ``traversal``, ``messages`` has ``traversal`` and
+    ``stored``.
+    """
     counts = cycles.drop_nulls("traversal").group_by("traversal").agg(uses=pl.len())
     last = cycles["start"].max()
     came = messages.filter(pl.col("stored") < pl.lit(last, pl.Int64)).select("traversal").unique()

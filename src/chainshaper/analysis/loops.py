@@ -4,7 +4,8 @@ ros2_control's update thread, a `rclcpp::Rate`, a `while` loop in Python: the la
 robots is no callback. The tracing library in front of ROS 2 records when such a thread goes to
 sleep and wakes up (`thread_sleep`, `thread_wake`).
 
-* **A turn** is what lies between two sleeps of a thread. It is an instance of the loop.
+* **A turn** is what lies between two sleeps of a thread. It is an instance of the loop. A wait
+  without a time (`pthread_cond_wait`) counts only in a thread that hardly sleeps otherwise.
 * **A loop** is a thread that publishes outside callbacks, or that the user named. One that
   publishes for several nodes is a loop of each. Topics that are never published in the same turn
   belong to different loops of one thread: each has the turns in which it published.
@@ -40,8 +41,12 @@ _THREAD = ["pid", "tid"]
 _TIMED_SHARE = 0.5  # of a loop's turns: so many must begin when the time to sleep was over
 _BLOCKED = 0.5  # share of its period that a loop waits at most, awake and without computing
 _EARLY = 0.05  # share of a sleep by which it may end early: not every middleware's clock is ours
+_EXACT = 0.01  # share of its period by which the instants until which a loop sleeps are off it
+_CHOSEN = 0.5  # of these instants, more must be so exactly a period apart
 _FOR_A_TIME = [SLEEPING_CALLS.index(name) for name in ("clock_nanosleep", "nanosleep", "timerfd")]
 """Calls by which a thread can only sleep, not wait for something."""
+_UNTIMED = SLEEPING_CALLS.index("pthread_cond_wait")
+_ALONE = 0.1  # other sleeps of a thread, for each of its waits without a time
 
 
 @dataclass(frozen=True)
@@ -95,6 +100,11 @@ def thread_turns(tables: events.EventTables) -> pl.DataFrame:
     wakes = events.table(tables, "thread_wake", ["thread_time"]).filter(pl.col("call") != 0)
     wakes = wakes.select(*columns, until=pl.lit(None, pl.Int64), wakes=pl.lit(True))
     rows = pl.concat([sleeps, wakes]).sort(*_THREAD, "time", "wakes", maintain_order=True)
+    # Middlewares wait without a time inside a publication, too. So such waits are between turns
+    # only in a thread that hardly sleeps otherwise.
+    untimed = (pl.col("call") == _UNTIMED).fill_null(False)
+    others = (~untimed & ~pl.col("wakes")).sum().over(_THREAD)
+    rows = rows.filter(~untimed | (others <= _ALONE * untimed.sum().over(_THREAD)))
 
     def beside(column: str, places: int) -> pl.Expr:
         """Return the column of the thread's sleep before (1) or after (-1) a row."""
@@ -320,10 +330,6 @@ def _turns_of(
 
 def _callback(callback_id: int, loop: _Loop, turns: pl.DataFrame) -> pl.DataFrame:
     """Make the row of a loop among callbacks."""
-    period = regular_period(turns["start"].sort().to_numpy())
-    due = turns["due"].drop_nulls().sort().to_numpy()
-    if period is not None and due.size == turns.height:  # more exact than when it woke up
-        period = regular_period(due) or period
     row = {
         "callback_id": callback_id,
         "pid": loop.pid,
@@ -331,7 +337,7 @@ def _callback(callback_id: int, loop: _Loop, turns: pl.DataFrame) -> pl.DataFram
         "valid_from": turns["start"].min(),
         "kind": "loop",
         "node": loop.node,
-        "period_ns": period,
+        "period_ns": loop_period(turns["start"], turns["due"]),
         "observed": False,
     }
     return pl.DataFrame([row | dict.fromkeys(CALLBACK_SCHEMA.keys() - row)], CALLBACK_SCHEMA)
@@ -405,11 +411,10 @@ def _overlong(turns: pl.DataFrame) -> pl.Expr:
 
     A rate loop that is late does not sleep at all: two of its iterations lie in one turn.
     """
-    starts = turns["start"].sort().to_numpy()
-    if not _is_regular(starts):
+    if loop_period(turns["start"], turns["due"]) is None:
         return pl.lit(False)
-    lasts = pl.col("end") - pl.col("start")
-    return (lasts >= float(np.median(np.diff(starts)))).fill_null(False)
+    usual = float(np.median(np.diff(turns["start"].sort().to_numpy())))
+    return (pl.col("end") - pl.col("start") >= usual).fill_null(False)
 
 
 def _is_regular(starts: npt.NDArray[np.int64]) -> bool:
@@ -427,6 +432,25 @@ def regular_period(starts: npt.NDArray[np.int64]) -> int | None:
     return roundest_period(apart, float(np.median(apart)))
 
 
+def loop_period(starts: pl.Series, due: pl.Series) -> int | None:
+    """Return the period (ns) of a loop; None: it sleeps irregularly, or started less than thrice.
+
+    ``starts`` are those of its instances, ``due`` until when it slept before each of them (ns;
+    null: not known). A machine that stands still, or is busy, makes starts irregular. The program
+    itself chooses until when it sleeps, so these instants count first: more than half of them are
+    a period apart, to a hundredth, by no chance. Where the program sleeps for a duration they are
+    as irregular as its computation, and the starts count.
+    """
+    chosen = due.drop_nulls().sort().to_numpy()
+    if 3 <= chosen.size >= _TIMED_SHARE * starts.len():
+        apart = np.diff(chosen)
+        usual = float(np.median(apart))
+        exact = np.abs(apart - usual) <= _EXACT * usual
+        if usual > 0 and float(np.mean(exact)) > _CHOSEN:
+            return roundest_period(apart[exact], usual)
+    return regular_period(starts.sort().to_numpy())
+
+
 def seems_regular(times: npt.NDArray[np.int64]) -> bool:
     """Return whether publications alone show that a loop makes them: enough, and regular."""
     return len(times) > FEWEST and _is_regular(times)
@@ -435,7 +459,7 @@ def seems_regular(times: npt.NDArray[np.int64]) -> bool:
 def _notes(loop: _Loop, turns: pl.DataFrame) -> Iterator[str]:
     """Say where a loop has no period."""
     starts = turns["start"].sort().to_numpy()
-    if len(starts) < 3 or _is_regular(starts):
+    if len(starts) < 3 or loop_period(turns["start"], turns["due"]) is not None:
         return
     low, usual, high = (
         duration_text(round(v)) for v in np.percentile(np.diff(starts), (5, 50, 95))

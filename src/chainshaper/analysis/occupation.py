@@ -79,10 +79,17 @@ def occupation(flow: DataFlow, info: RecordingInfo, published: pl.Series) -> Occ
     )
 
 
+def _starts(tables: events.EventTables) -> pl.DataFrame:
+    """Return when callbacks and instances of loops started, in which thread and on which core."""
+    columns = ("time", "pid", "tid", "cpu")
+    started = events.table(tables, "callback_start", ["cpu"]).select(columns)
+    woke = events.table(tables, "thread_wake", ["cpu"]).filter(pl.col("call") != 0).select(columns)
+    return pl.concat([started, woke]).sort("time", maintain_order=True) if len(woke) else started
+
+
 def thread_cores(flow: DataFlow, info: RecordingInfo) -> dict[ThreadKey, int | None]:
     """Map each thread that runs callbacks to the core that it is bound to; None: to none."""
-    starts = events.table(flow.events, "callback_start").select("time", "pid", "tid", "cpu")
-    starts = starts.drop_nulls()
+    starts = _starts(flow.events).drop_nulls()
     threads = flow.instances.select("pid", "tid").unique(maintain_order=True)
     cores: dict[ThreadKey, int | None]
     cores = dict.fromkeys(((pid, tid) for pid, tid in threads.iter_rows()), None)
@@ -103,7 +110,7 @@ def _places(
     flow: DataFlow, cores: dict[ThreadKey, int | None]
 ) -> tuple[dict[tuple[int, ...], list[int]], int]:
     """Return the ``places`` and ``settled_ns`` of an :class:`Occupation`."""
-    starts = events.table(flow.events, "callback_start").select("pid", "tid", "cpu", start="time")
+    starts = _starts(flow.events).rename({"time": "start"})
     starts = starts.unique(["pid", "tid", "start"], keep="first")
     ran = flow.instances.select("pid", "tid", "start")
     ran = ran.join(starts, on=["pid", "tid", "start"], how="left", maintain_order="left")

@@ -134,7 +134,14 @@ def _misuse_text(error: Any, words: list[str], name: str) -> str:
         sys.exit(error.exit_code)
     help_of = name if error.ctx is None else error.ctx.command_path
     message = error.format_message().rstrip(".")
-    return f"{message[:1].lower()}{message[1:]}: see `{help_of} --help`"
+    message = f"{message[:1].lower()}{message[1:]}"
+    if type(error).__name__ == "NoSuchOption" and error.option_name == "--loop":
+        return (
+            f"{message}: loops are named where their sleeps are recorded, by `record`, `profile`,"
+            " `shape -- ros2 launch …` and `watch`; a recording knows its own (`chainshaper"
+            " callbacks REC`)"
+        )
+    return f"{message}: see `{help_of} --help`"
 
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

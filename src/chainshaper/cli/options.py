@@ -178,6 +178,12 @@ SOURCE: Source | None = option(
     "Tracer. Default: preload, or lttng where that cannot be had.",
     rich_help_panel=TRACING,
 )
+LOOPS: list[str] | None = option(
+    "--loop NAME",
+    "A loop that is no callback, by its node (/name) or its thread's name (preload; may be "
+    "repeated). For threads that publish nothing, as those that write to hardware.",
+    rich_help_panel=TRACING,
+)
 NODE: NodeChoice = option(
     "--node auto|python|cpp",
     "The shaping node in Python, which needs no building, or in C++. auto: in C++ where it is built"

@@ -252,12 +252,7 @@ def record(
     ),
     user: list[str] | None = opt.USERS,
     buffer: int | None = BUFFER,
-    loop: list[str] | None = opt.option(
-        "--loop NAME",
-        "A loop that is no callback, by its node (/name) or its thread's name (preload; may be "
-        "repeated). For threads that publish nothing, as those that write to hardware.",
-        rich_help_panel=opt.TRACING,
-    ),
+    loop: list[str] | None = opt.LOOPS,
     watch_stalls: bool = opt.option(
         "--watch-stalls",
         "Have a sleeper on every core notice when the machine itself stands still.",
@@ -366,6 +361,7 @@ def watch(
         rich_help_panel="Other programs",
     ),
     user: list[str] | None = opt.USERS,
+    loop: list[str] | None = opt.LOOPS,
     environment: bool = opt.option(
         "--environment",
         "Print the export line that enables watching, and exit.",
@@ -373,7 +369,7 @@ def watch(
     ),
     json: bool = opt.option("--json", "Print a JSON object a line at each look.", False),
 ) -> None:
-    """Watch the chains of a running application: latency now, over a minute, over an hour.
+    """Watch the chains and loops of a running application: now, over a minute, over an hour.
 
     The application needs the library in front of ROS 2: `eval "$(chainshaper watch --environment)"`
     before it is started, or start it here, as COMMAND. Watching needs no root and changes nothing.
@@ -383,16 +379,17 @@ def watch(
     from chainshaper.monitor.budgets import Budget, load_budget
     from chainshaper.monitor.watch import Watch, exporting
     from chainshaper.reporting.overviews import watch_tables
-    from chainshaper.sources.preload import in_front, installed_library
+    from chainshaper.sources.preload import in_front, installed_library, named_loops
     from chainshaper.values.recording import refuse_existing
 
+    variables = named_loops.variables(loop or [])
     if environment:
-        for name, value in in_front(installed_library()).items():
+        for name, value in {**in_front(installed_library()), **variables}.items():
             out.show_line(f"export {name}={shlex.quote(value)}")
         return
     known = opt.plan_in_force(plan)
     limits = Budget() if budget is None else load_budget(budget)
-    chains = _chains_to_watch(chain or [], known, limits)
+    chains = _chains_to_watch(chain or [], known, limits, loop or [])
     if budget is not None or recorder != Path():
         refuse_existing(recorder / "watch-DATE-TIME")
     if command:
@@ -400,7 +397,7 @@ def watch(
     with out.stop_on_signals() as stop, ExitStack() as until:
         started = None
         if command:
-            variables = in_front(installed_library())
+            variables = {**in_front(installed_library()), **variables}
             started = child_processes.start_command(command, variables, STDERR)
             until.callback(child_processes.end_command, started)
         show = until.enter_context(out.live())
@@ -412,6 +409,7 @@ def watch(
             plan=known,
             longest_ns=longest,
             callbacks=bool(limits.callbacks),
+            loops=loop or [],
         )
         publish = _publisher(watched, until) if diagnostics else lambda _: None
         next_look, judged = time.monotonic_ns() + every, _judging(limits, watched, recorder)
@@ -424,6 +422,8 @@ def watch(
                 next_look += (1 + late // every) * every  # looks that were missed are left out
                 out.notes(export(seen := watched.look()))
                 publish(seen)
+                for missed in seen.missed:
+                    out.say(missed)
                 broken = [limit.text for limit in judged(seen)]
                 if json:
                     out.print_json(seen.as_json() | {"broken": broken}, indent=None)
@@ -434,16 +434,20 @@ def watch(
 
 
 def _chains_to_watch(
-    chains: "Sequence[str]", plan: "cs.Plan | None", limits: "Budget"
+    chains: "Sequence[str]", plan: "cs.Plan | None", limits: "Budget", loops: "Sequence[str]"
 ) -> list[str]:
-    """Return the chains that are named, or else those of the plan; and those that have limits."""
+    """Return the chains that are named, or else those of the plan; and those that have limits.
+
+    There may be none where loops are named, or have limits. Raises InputError: nothing is named.
+    """
     specs = [*chains]
     if not specs and plan is not None:
         specs = [spec for chain_plan in plan.chains if (spec := chain_plan.chain.spec)]
     specs += [of_chain.chain for of_chain in limits.chains]
-    if not specs:
+    if not (specs or loops or limits.loops):
         raise InputError(
-            "no chain is named: give --chain FIRST..LAST, such as /t1../t5, or --plan or --budget"
+            "no chain is named: give --chain FIRST..LAST, such as /t1../t5, or --plan or --budget,"
+            " or --loop for a loop alone"
         )
     return list(dict.fromkeys(specs))
 
@@ -471,7 +475,7 @@ def _judging(
         if not named_at and any(seen.processes.values()):
             named_at = seen.at_ns + PATIENCE_NS
         if 0 < named_at <= seen.at_ns:
-            out.notes(not_running(limits, seen))
+            out.notes([*not_running(limits, seen), *watched.unseen_loops()])
             named_at = -1
         return broken
 
@@ -550,6 +554,7 @@ def profile(
     source: opt.Source | None = opt.SOURCE,
     duration: int | None = DURATION,
     buffer: int | None = BUFFER,
+    loop: list[str] | None = opt.LOOPS,
     json: bool = opt.JSON,
 ) -> None:
     """Record with the chain's threads under SCHED_FIFO, DDS threads on another core.
@@ -593,6 +598,7 @@ def profile(
             source=source,
             duration_ns=duration,
             buffer=buffer and buffer << 20,
+            loops=loop or [],
             chain=chains[0] if chains else None,
             scheduling=cs.profiling_condition(
                 core_of,
@@ -655,6 +661,7 @@ def shape(
     since: int = opt.SINCE,
     until: int | None = opt.UNTIL,
     source: opt.Source | None = opt.SOURCE,
+    loop: list[str] | None = opt.LOOPS,
     node: NodeChoice = opt.NODE,
     backend: str = opt.option(
         "--backend NAME",
@@ -683,6 +690,11 @@ def shape(
     if len(words) == 2 and words[0].endswith(opt.DESCRIPTIONS):
         if chain or sink or throttle or mode_profile or request != cs.PlanRequest():
             raise InputError("a described application is shaped as plan.yaml says: plan it so")
+        if loop:
+            raise InputError(
+                "the loops of a described application are those of its description (`loop:`):"
+                " leave out --loop"
+            )
         application, planned = cs.load_application(words[0]), cs.load_plan(words[1])
         out.warn(planned)
         with out.progress(f"shaping {application.name}") as report:
@@ -716,6 +728,7 @@ def shape(
             until_ns=until,
             duration_ns=duration,
             source=source,
+            loops=loop or (),
             node=node,
             back_end=backend,
             adapt=adapt,

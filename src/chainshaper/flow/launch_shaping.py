@@ -34,7 +34,7 @@ from chainshaper.flow.profiling_condition import (
     profiling_condition,
     undelayed,
 )
-from chainshaper.flow.record import Scheduling, record_command
+from chainshaper.flow.record import Scheduling, check_loops, record_command
 from chainshaper.linux.processes import RunningProcess, run_users
 from chainshaper.linux.scheduling import check_cores, may_use_fifo
 from chainshaper.planning import ChainPlan, Plan, PlanRequest, Profile
@@ -90,6 +90,7 @@ def shape_launch(
     until_ns: int | None = None,
     duration_ns: int = 60_000_000_000,
     source: Literal["lttng", "preload", "ebpf"] | None = None,
+    loops: Sequence[str] = (),
     node: NodeChoice = "auto",
     back_end: str = "auto",
     adapt: bool = False,
@@ -105,9 +106,10 @@ def shape_launch(
     chains to further outputs of the graph of one chain, ``throttled`` inputs with the nodes that
     get them by way of a throttler, from the first recording on. ``request.cores`` are where
     executors run (default: the last core, and others that are worth it). The application is
-    launched briefly, and for ``duration_ns`` before and after. ``planned`` gets the plan before it
-    is used. ``stop`` ends everything. The rest is for :func:`.profile_chains` and
-    :func:`.apply_plan`.
+    launched briefly, and for ``duration_ns`` before and after. ``loops`` are names of nodes and
+    threads whose loops are recorded although they publish nothing (`preload` only). ``planned``
+    gets the plan before it is used. ``stop`` ends everything. The rest is for
+    :func:`.profile_chains` and :func:`.apply_plan`.
 
     Raises InputError: ``folder`` is not empty, the command is not `ros2 launch`, or what it
     launches does not fit. PlatformError, OperationError: there is no such core, or a step failed;
@@ -116,11 +118,13 @@ def shape_launch(
     launch, request = parse_launch_command(command), request or PlanRequest()
     chains = [chain] if isinstance(chain, str) else [*(chain or ())]
     _refuse_early(request, chains, sinks, throttled, bool(mode_recordings))
+    check_loops(loops, source)
     if language_of(node, builds=True)[0] == "cpp":
         check_build_tools()
     folder, user_ids = refuse_existing(folder), run_users(users)
     folder.mkdir(exist_ok=True)
-    recorder = _Recorder(folder, source, duration_ns, stop or threading.Event(), progress)
+    ends = stop or threading.Event()
+    recorder = _Recorder(folder, source, duration_ns, ends, progress, tuple(loops))
     launched = _Launched(tuple(command), launch)
     if throttled:
         request = replace(request, anchor="cycle")  # messages have the stamps of their sensors
@@ -215,6 +219,7 @@ class _Recorder:
     duration_ns: int  # of all recordings but the first
     stop: threading.Event
     progress: Callable[[float, str], None]
+    loops: tuple[str, ...] = ()
 
     def record(
         self,
@@ -234,6 +239,7 @@ class _Recorder:
             self.folder / name,
             launched.command,
             source=self.source,
+            loops=self.loops,
             duration_ns=FIRST_LOOK_NS if name == "first" else self.duration_ns,
             chain=chain,
             scheduling=scheduling,

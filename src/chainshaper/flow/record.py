@@ -204,11 +204,7 @@ def _tracer(
     if source is None:
         # A given buffer, and processes that run already, are LTTng's to answer.
         source = "lttng" if buffer is not None or not command else "preload"
-    if loops and (source != "preload" or not command):
-        raise InputError(
-            "the sleep of a loop is seen by `--source preload` alone, in what it starts itself:"
-            " leave out --loop, or record `--source preload … -- COMMAND`"
-        )
+    check_loops(loops, source)
     if source == "lttng":
         return lttng.LttngSession(folder, command, pids, buffer, users)
     if source not in ("ebpf", "preload"):
@@ -220,6 +216,17 @@ def _tracer(
     if source == "preload":
         return preload.PreloadTracer(folder, command, pids, users, loops)
     return ebpf.EbpfTracer(folder, command, pids, users)
+
+
+def check_loops(loops: Sequence[str], source: str | None) -> None:
+    """Refuse names of loops that a source (None: `preload`) cannot follow. Raises InputError."""
+    preload.named_loops.names_text(loops)
+    if loops and source not in (None, "preload"):
+        raise InputError(
+            f"--source {source} does not see how threads sleep, `--source preload` alone does:"
+            " leave out --loop (a loop that publishes is seen from its publications), or take"
+            " `--source preload`"
+        )
 
 
 def _trace(

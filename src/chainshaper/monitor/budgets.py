@@ -1,16 +1,24 @@
-"""Budgets: what a chain, its hops and callbacks may take, and which recordings keep to it.
+"""Budgets: what a chain, its hops, callbacks and loops may take, and which recordings keep to it.
 
     format: 1
     chains:
       - {chain: /t1../t5, maximum: 80ms, percentiles: {'99': 75ms}, jitter: 40ms, missing: 1%,
-         hops: [{topic: /t3, communication: 1ms, computation: 22ms}]}
+         hops: [{topic: /t3, communication: 1ms, computation: 22ms}],
+         age_at_loop: {minimum: 2ms, maximum: 14ms, percentiles: {'99': 12ms}, jitter: 10ms,
+                       never: 1%, again: 55%}}
     callbacks:
       - {node: /filter, starts: /t2, response: 25ms, execution: 22ms}
+    loops:
+      - {node: /controller_manager, publishes: /command, shortest_period: 9ms, period: 11ms,
+         start_jitter: 500us, overruns: 1%}
 
 Limits hold for all cycles, also those that the machine disturbed. A limit that only these break is
 broken, and its message says so. ``missing`` is the share of outputs that were late or never came;
 ``starts`` is the topic that starts a callback, or the declared period of its timer, as
-`chainshaper callbacks` shows it.
+`chainshaper callbacks` shows it. ``age_at_loop`` is about the data of the chain's last loop, over
+all of its cycles; ``never`` and ``again`` are shares of the messages: used in no cycle, and in
+several. ``overruns`` is a share of a loop's instances. ``minimum`` and ``shortest_period`` are the
+least that is allowed, all others the most.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,6 +33,7 @@ from pydantic import BeforeValidator, Field, PlainSerializer, SerializationInfo
 
 from chainshaper.analysis import recorded_flow
 from chainshaper.analysis.contradictions import refuse_contradicted
+from chainshaper.analysis.data_age import DataAge, use_shares
 from chainshaper.analysis.latency import (
     PERCENTILES,
     LatencyStatistics,
@@ -32,6 +41,7 @@ from chainshaper.analysis.latency import (
     latency_statistics,
     longest_times,
 )
+from chainshaper.analysis.loop_rates import LoopRate, loop_instances, loop_label, loop_rates
 from chainshaper.sources import open_source
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import ChainshaperError, InputError, shown
@@ -48,7 +58,8 @@ if TYPE_CHECKING:
 
 ROOM = 0.1  # a proposed limit is so much above what was measured (a share of it)
 GRAIN_NS = 10_000  # proposed limits are whole multiples of it
-LEAST_MISSING = 0.01  # the lowest limit that is proposed for `missing`
+LEAST_MISSING = 0.01  # the lowest limit that is proposed for a share
+SHARES = ("missing", "overruns", "never used", "used again")  # figures that are no times
 EVENTS = "its events"  # what cannot be measured of a recording that cannot be read
 
 
@@ -81,6 +92,17 @@ class HopBudget(Part):
     waiting_ns: PositiveDuration | None = None
 
 
+class AgeBudget(Part):
+    """How old the data may be that a loop works with, and how often it may use them."""
+
+    minimum_ns: PositiveDuration | None = None
+    maximum_ns: PositiveDuration | None = None
+    percentiles: dict[Percentile, PositiveDuration] = Field(default_factory=dict)
+    jitter_ns: PositiveDuration | None = None
+    never: Share | None = None  # of the messages: used in no cycle
+    again: Share | None = None  # of the messages: used in several cycles
+
+
 class ChainBudget(Part):
     """The limits of a chain's latency."""
 
@@ -90,6 +112,7 @@ class ChainBudget(Part):
     jitter_ns: PositiveDuration | None = None
     missing: Share | None = None
     hops: tuple[HopBudget, ...] = Field(default=(), strict=False)
+    age_at_loop: AgeBudget | None = None
 
 
 class CallbackBudget(Part):
@@ -101,17 +124,37 @@ class CallbackBudget(Part):
     execution_ns: PositiveDuration | None = None  # of CPU time
 
 
+class LoopBudget(Part):
+    """The rate that one loop has to keep."""
+
+    node: str
+    publishes: str | None = None  # one of its topics; None: any loop of the node, the worst counts
+    shortest_period_ns: PositiveDuration | None = None
+    period_ns: PositiveDuration | None = None  # the longest
+    start_jitter_ns: PositiveDuration | None = None
+    overruns: Share | None = None  # of its instances
+
+    @property
+    def label(self) -> str:
+        return loop_label(self.node, () if self.publishes is None else (self.publishes,))
+
+    def is_of(self, rate: LoopRate) -> bool:
+        """Return whether a loop is the one that these limits are for."""
+        return rate.node == self.node and self.publishes in (None, *rate.publishes)
+
+
 class Budget(Part):
     """A budget file."""
 
     format: Literal[1] = 1
     chains: tuple[ChainBudget, ...] = Field(default=(), strict=False)
     callbacks: tuple[CallbackBudget, ...] = Field(default=(), strict=False)
+    loops: tuple[LoopBudget, ...] = Field(default=(), strict=False)
 
 
 @dataclass(frozen=True)
 class Judged:
-    """One limit, and the figure of one recording beside it: ns, or a share for ``missing``."""
+    """One limit, and the figure of one recording beside it: ns, or a share (:data:`SHARES`)."""
 
     recording: str
     where: str  # the chain, or the callback
@@ -120,10 +163,16 @@ class Judged:
     measured: float | None  # None: nothing was measured, which breaks the limit
     undisturbed: float | None = None  # of cycles that the machine did not disturb; None: unknown
     because: str | None = None  # where a broken limit comes from, or why nothing was measured
+    at_least: bool = False  # whether it is broken by less, not by more
 
     @property
     def met(self) -> bool:
-        return self.measured is not None and self.measured <= self.limit
+        return self._meets(self.measured)
+
+    def _meets(self, measured: float | None) -> bool:
+        if measured is None:
+            return False
+        return measured >= self.limit if self.at_least else measured <= self.limit
 
     @property
     def text(self) -> str:
@@ -131,19 +180,25 @@ class Judged:
         if self.measured is None:
             return f"{self.where}: {self.figure} could not be measured; {self.because}"
         measured, limit = self._value(self.measured), self._value(self.limit)
-        line = f"{self.where}: {self.figure} {measured}, budget {limit}"
-        if not self.met and self.undisturbed is not None and self.undisturbed <= self.limit:
+        bound = "at least " if self.at_least else ""
+        line = f"{self.where}: {self.figure} {measured}, budget {bound}{limit}"
+        if not self.met and self.undisturbed is not None and self._meets(self.undisturbed):
             line += f", {self._value(self.undisturbed)} where the machine disturbed nothing"
         return line if self.because is None else f"{line}; {self.because}"
 
     def _value(self, value: float) -> str:
-        return f"{value:.2%}" if self.figure == "missing" else duration_text(round(value))
+        return f"{value:.2%}" if self.is_share else duration_text(round(value))
+
+    @property
+    def is_share(self) -> bool:
+        """Whether the figure is a share, not a time."""
+        return self.figure in SHARES
 
 
 def load_budget(path: str | Path) -> Budget:
     """Read a budget file. Raises InputError: as :func:`.read_model`, or it has no limits."""
     budget = read_model(path, Budget, made_by="written by `chainshaper budget`")
-    if not (budget.chains or budget.callbacks):
+    if not (budget.chains or budget.callbacks or budget.loops):
         raise InputError(f"{path} has no limits: `chainshaper budget REC -o FILE` proposes some")
     return budget
 
@@ -158,7 +213,7 @@ def save_budget(budget: Budget, path: str | Path) -> Path:
 
 
 def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float = ROOM) -> Budget:
-    """Propose limits for chains, hops and callbacks: what was measured, and ``room`` above it.
+    """Propose limits for chains, hops, callbacks and loops: what was measured, and ``room`` beyond.
 
     Without ``chains``, for the chain that the recording names, or the only one in it.
 
@@ -166,7 +221,7 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
     """
 
     def limit(ns: float | None) -> int | None:
-        return None if ns is None else -int(-ns * (1 + room) // GRAIN_NS) * GRAIN_NS or None
+        return _most(ns, room)
 
     of_chains, flow = [], recorded_flow(recording)
     for chain in chains or [chain_of(recording, None, flow)]:
@@ -182,21 +237,69 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
             for topic, parts in _longest_parts(hop_breakdown(analysis)).items()
         )
         missing = outputs_due(analysis).share or 0.0
+        age = None if analysis.data_age is None else _proposed_age(analysis.data_age, room)
         of_chains.append(
             ChainBudget(
                 chain=chain,
                 maximum_ns=limit(figures.max_ns),
                 percentiles={percentile: ns for percentile, ns in percentiles.items() if ns},
                 jitter_ns=limit(figures.jitter_ns),
-                missing=min(1.0, max(LEAST_MISSING, round(missing * (1 + room), 4))),
+                missing=_most_share(missing, room),
                 hops=hops,
+                age_at_loop=age,
             )
         )
     callbacks = tuple(
         CallbackBudget(node=node, starts=starts, response_ns=limit(took), execution_ns=limit(used))
         for (node, starts), (took, used, _) in longest_times(flow).items()
     )
-    return Budget(chains=tuple(of_chains), callbacks=callbacks)
+    loops = tuple(_proposed_loop(rate, room) for rate in loop_rates(loop_instances(flow)))
+    return Budget(chains=tuple(of_chains), callbacks=callbacks, loops=loops)
+
+
+def _most(ns: float | None, room: float) -> int | None:
+    """Return a limit that lies ``room`` above what was measured."""
+    # To a thousandth, since 150 times 1.1 is a little more than 165 in binary numbers.
+    return None if ns is None else -int(-round(ns * (1 + room), 3) // GRAIN_NS) * GRAIN_NS or None
+
+
+def _least(ns: float | None, room: float) -> int | None:
+    """Return a limit that lies ``room`` below what was measured."""
+    return None if ns is None else int(round(ns * (1 - room), 3) // GRAIN_NS) * GRAIN_NS or None
+
+
+def _most_share(share: float, room: float) -> float:
+    """Return a limit for a share, ``room`` above what was measured."""
+    return min(1.0, max(LEAST_MISSING, round(share * (1 + room), 4)))
+
+
+def _proposed_age(age: DataAge, room: float) -> AgeBudget:
+    """Propose limits for the age of a loop's data."""
+    figures = latency_statistics(age.at_loop_ns.to_numpy())
+    never, again = use_shares(age.uses)
+    wanted: tuple[Percentile, ...] = ("50", "99")
+    limits = {name: _most(figures.percentiles_ns.get(name), room) for name in wanted}
+    return AgeBudget(
+        minimum_ns=_least(figures.min_ns, room),
+        maximum_ns=_most(figures.max_ns, room),
+        percentiles={name: ns for name, ns in limits.items() if ns},
+        jitter_ns=_most(figures.jitter_ns, room),
+        never=None if never is None else _most_share(never, room),
+        again=None if again is None else _most_share(again, room),
+    )
+
+
+def _proposed_loop(rate: LoopRate, room: float) -> LoopBudget:
+    """Propose limits for a loop's rate."""
+    share = rate.overrun_share
+    return LoopBudget(
+        node=rate.node,
+        publishes=rate.publishes[0] if rate.publishes else None,
+        shortest_period_ns=_least(rate.period_ns, room),
+        period_ns=_most(rate.period_ns, room),
+        start_jitter_ns=_most(rate.start_jitter_ns, room),
+        overruns=None if share is None else _most_share(share, room),
+    )
 
 
 def check_budget(recording: Recording, budget: Budget, name: str | None = None) -> list[Judged]:
@@ -216,6 +319,7 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
                 judged.append(
                     Judged(name, chain.chain, figure, limit, measured, because=str(error))
                 )
+            judged += _judged_age(name, chain, None, None, str(error))
             continue
         parts = hop_breakdown(analysis)
         hops = list(_judged_hops(name, chain, _longest_parts(parts)))
@@ -227,7 +331,10 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
             verdict = Judged(name, chain.chain, figure, limit, measured, calm)
             judged.append(verdict if verdict.met else replace(verdict, because=because))
         judged += hops
-    return [*judged, *_judged_callbacks(name, budget.callbacks, longest_times(flow))]
+        judged += _judged_ages_of(name, chain, analysis.data_age)
+    judged += _judged_callbacks(name, budget.callbacks, longest_times(flow))
+    rates = loop_rates(loop_instances(flow)) if budget.loops else []
+    return [*judged, *_judged_loops(name, budget.loops, rates)]
 
 
 def check_budgets(
@@ -282,16 +389,22 @@ def broken_limits(budget: Budget, seen: "Seen") -> list[Judged]:
                 judged.append(Judged("now", chain.chain, figure, limit, measured, because=reason))
             longest = {hop.topic: dict(zip(PARTS, hop.longest_ns, strict=True)) for hop in now.hops}
             judged += _judged_hops("now", chain, longest)
+        if now.age is not None and now.age.at_loop.count:
+            shares, reason = (now.age.never, now.age.again), "no message came in the last minute"
+            judged += _judged_age("now", chain, now.age.at_loop, shares, reason)
     times = {(callback.node, callback.starts): callback.longest_ns for callback in seen.callbacks}
     running = [
         callback for callback in budget.callbacks if (callback.node, callback.starts) in times
     ]
     judged += _judged_callbacks("now", running, times)
+    rates = [loop.rate for loop in seen.loops]
+    looping = [loop for loop in budget.loops if any(loop.is_of(rate) for rate in rates)]
+    judged += _judged_loops("now", looping, rates)
     return [verdict for verdict in judged if not verdict.met]
 
 
 def not_running(budget: Budget, seen: "Seen") -> Iterator[str]:
-    """Yield a sentence for each chain and callback of a budget that has never run."""
+    """Yield a sentence for each chain, callback and loop of a budget that has never run."""
     ran = {(callback.node, callback.starts) for callback in seen.callbacks}
     named = {chain.chain for chain in budget.chains}
     for chain in seen.chains:
@@ -302,6 +415,13 @@ def not_running(budget: Budget, seen: "Seen") -> Iterator[str]:
             yield (
                 f"the budget's callback {callback.node} ({callback.starts}) has not run yet:"
                 " `chainshaper callbacks` shows node and start of those in a recording"
+            )
+    rates = [loop.rate for loop in seen.loops]
+    for loop in budget.loops:
+        if not any(loop.is_of(rate) for rate in rates):
+            yield (
+                f"the budget's {loop.label} has not run yet: {_loops_text(rates)}. A loop that"
+                " publishes nothing is to be named (--loop) where the application is started"
             )
 
 
@@ -352,6 +472,85 @@ def _judged_callbacks(
             where, times = f"{callback.node} ({measured.shown})", measured.times
             reason = "the recording has no such time"
         yield from _judged(name, where, limits, times, reason)
+
+
+def _judged_ages_of(name: str, chain: ChainBudget, age: DataAge | None) -> Iterator[Judged]:
+    """Judge the limits of the age of the chain's data at its loop."""
+    if age is None:
+        reason = (
+            "no loop reads what this chain stores: `chainshaper graph` shows loops and what they"
+            " read; one that publishes nothing is recorded with --loop, and its chain ends with"
+            " NODE:end"
+        )
+        return _judged_age(name, chain, None, None, reason)
+    figures = latency_statistics(age.at_loop_ns.to_numpy())
+    return _judged_age(name, chain, figures, use_shares(age.uses), "its loop used no message")
+
+
+def _judged_age(
+    name: str,
+    chain: ChainBudget,
+    figures: LatencyStatistics | None,
+    shares: tuple[float | None, float | None] | None,
+    reason: str,
+) -> Iterator[Judged]:
+    """Judge the limits of the age of data; ``reason`` says why a figure is not known.
+
+    ``shares`` are those of messages that were never used, and used again.
+    """
+    limits = chain.age_at_loop
+    if limits is None:
+        return
+    statistics, (never, again) = figures or latency_statistics([]), shares or (None, None)
+    judged: list[tuple[str, float | None, float | None]] = [
+        ("lowest age", limits.minimum_ns, statistics.min_ns),
+        ("highest age", limits.maximum_ns, statistics.max_ns),
+    ]
+    for percentile, limit in limits.percentiles.items():
+        judged.append((f"age p{percentile}", limit, statistics.percentiles_ns.get(percentile)))
+    judged += [
+        ("jitter of age", limits.jitter_ns, statistics.jitter_ns),
+        ("never used", limits.never, never),
+        ("used again", limits.again, again),
+    ]
+    for figure, most, measured in judged:
+        if most is not None:
+            because, where = reason if measured is None else None, f"{chain.chain} at its loop"
+            at_least = figure == "lowest age"
+            yield Judged(name, where, figure, most, measured, None, because, at_least)
+
+
+def _judged_loops(
+    name: str, loops: Sequence[LoopBudget], rates: Sequence[LoopRate]
+) -> Iterator[Judged]:
+    """Judge the limits of loops; of several that a limit is for, the worst counts."""
+    for loop in loops:
+        here = [rate for rate in rates if loop.is_of(rate)]
+        absent = (
+            f"the recording has no such loop: {_loops_text(rates)}; a loop that publishes nothing"
+            " is recorded with --loop, and one that is paced by data is none"
+        )
+        irregular = next((rate.irregular for rate in here if rate.period_ns is None), "")
+        unseen = "no event shows how it sleeps: record with `--source preload`"
+        limits: list[tuple[str, float | None, list[float | None], str]] = [
+            ("shortest period", loop.shortest_period_ns, [r.period_ns for r in here], irregular),
+            ("period", loop.period_ns, [r.period_ns for r in here], irregular),
+            ("jitter of start", loop.start_jitter_ns, [r.start_jitter_ns for r in here], unseen),
+            ("overruns", loop.overruns, [r.overrun_share for r in here], unseen),
+        ]
+        for figure, limit, figures, unknown in limits:
+            if limit is None:
+                continue
+            known = [value for value in figures if value is not None]
+            at_least = figure == "shortest period"
+            measured = (min if at_least else max)(known) if known and known == figures else None
+            because = None if measured is not None else unknown if here else absent
+            yield Judged(name, loop.label, figure, limit, measured, None, because, at_least)
+
+
+def _loops_text(rates: Sequence[LoopRate]) -> str:
+    """Name the loops that there are."""
+    return f"it has the {', the '.join(rate.label for rate in rates)}" if rates else "it has none"
 
 
 def _judged(

@@ -30,6 +30,7 @@ from chainshaper.analysis import (
     graph_of,
     traverse,
 )
+from chainshaper.analysis.data_age import count_uses, data_age, use_shares
 from chainshaper.analysis.disturbance import Due, with_punctuality
 from chainshaper.analysis.latency import (
     LatencyStatistics,
@@ -39,7 +40,7 @@ from chainshaper.analysis.latency import (
 )
 from chainshaper.analysis.messages import has_stampless
 from chainshaper.analysis.objects import Objects, resolve_objects
-from chainshaper.analysis.traversals import OWES_NO_OUTPUT
+from chainshaper.analysis.traversals import OWES_NO_OUTPUT, Traversals
 from chainshaper.monitor.metrics import (
     EVERY_MS,
     LONGEST_END_MS,
@@ -47,6 +48,7 @@ from chainshaper.monitor.metrics import (
     delivery_news,
     serving,
 )
+from chainshaper.monitor.watched_loops import LoopNow, WatchedLoops
 from chainshaper.planning import ChainPlan, Plan
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.robot.clocks import clock_offset
@@ -57,6 +59,7 @@ from chainshaper.sources.preload import (
     event_tables,
     joined_tables,
     memories,
+    named_loops,
 )
 from chainshaper.sources.system import info_of, own_pid_namespace, processes_of
 from chainshaper.sources.tracing_library import TracingLibrary
@@ -103,6 +106,15 @@ class CallbackNow:
 
 
 @dataclass(frozen=True)
+class AgeNow:
+    """What the chain's loop worked with over the last minute, over all of its cycles."""
+
+    at_loop: LatencyStatistics  # how old the messages were when it read them
+    never: float | None  # share of the messages that no cycle used; None: none came
+    again: float | None  # share of those that several cycles used
+
+
+@dataclass(frozen=True)
 class ChainNow:
     """The figures of one chain at one look.
 
@@ -126,6 +138,7 @@ class ChainNow:
     problem: str | None  # why nothing goes through the chain
     outputs: OutputsDue  # over the hour
     kept: bool | None  # whether they keep the plan's promise; None: no plan, or no cycle
+    age: AgeNow | None = None  # None: no loop reads what the chain stores
 
 
 @dataclass(frozen=True)
@@ -138,6 +151,8 @@ class Seen:
     chains: tuple[ChainNow, ...]
     callbacks: tuple[CallbackNow, ...] = ()  # where the watch was asked for them
     left_out: tuple[str, ...] = ()  # which processes with the library are not seen, and why
+    loops: tuple[LoopNow, ...] = ()
+    missed: tuple[str, ...] = ()  # which loops missed their rate, when, and who ran on their core
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -189,6 +204,8 @@ class _Chain:
         communication_ns, computation_ns, waiting_ns: sums over cycles.
         longest_communication_ns, longest_computation_ns, longest_waiting_ns: of one cycle.
         count: how many cycles.
+
+    ``ages`` has the cycles and messages of the chain's loop (:func:`_ages`).
     """
 
     text: str
@@ -196,6 +213,7 @@ class _Chain:
     slots: tuple[tuple[int, int], ...]
     cycles: pl.DataFrame = field(default_factory=lambda: pl.DataFrame(schema=_CYCLE))
     hops: deque[tuple[int, pl.DataFrame]] = field(default_factory=deque)
+    ages: deque[tuple[int, tuple[pl.DataFrame, pl.DataFrame]]] = field(default_factory=deque)
     names: list[tuple[str, str]] = field(default_factory=list)  # node and topic of each hop
     first: Callback | None = None  # where cycles began when the chain was seen last
     counted: Counter[str] = field(
@@ -228,6 +246,17 @@ class _Chain:
         return latency_statistics(
             whole["latency_ns"].to_numpy(), incomplete=begun.height - whole.height, late=late
         )
+
+    def age(self) -> AgeNow | None:
+        """Return what the chain's loop worked with."""
+        if not self.ages:
+            return None
+        cycles, messages = (
+            pl.concat([of_look[place] for _, of_look in self.ages]) for place in (0, 1)
+        )
+        known = cycles.drop_nulls("traversal")["age_at_loop_ns"]
+        uses, _ = count_uses(cycles, messages)
+        return AgeNow(latency_statistics(known.to_numpy()), *use_shares(uses))
 
     def worst_ns(self, since_ns: int) -> tuple[int, ...]:
         """Return the start of the worst cycle since an instant: without output, or the longest."""
@@ -273,8 +302,9 @@ class Watch:
 
     ``chains`` are written as for `--chain`. Processes of ``users`` are followed. A cycle that takes
     longer than ``longest_ns`` counts as incomplete. ``plan`` says when outputs are due. With
-    ``callbacks`` the watch follows the times of all callbacks, too. Call :meth:`read` every tenth
-    of a second or so between two looks, or events are overwritten before they are read.
+    ``callbacks`` the watch follows the times of all callbacks, too. ``loops`` are names of loops
+    that are looked for; all that are seen are followed. Call :meth:`read` every tenth of a second
+    or so between two looks, or events are overwritten before they are read.
     """
 
     def __init__(
@@ -285,8 +315,11 @@ class Watch:
         plan: Plan | None = None,
         longest_ns: int = 2 * SECOND,
         callbacks: bool = False,
+        loops: Sequence[str] = (),
     ) -> None:
+        self._named_loops = loops
         self.callbacks: deque[tuple[int, Any]] | None = deque() if callbacks else None
+        self.loops = WatchedLoops()
         self.users, self.plan, self.longest_ns = users, plan, longest_ns
         self.due = [] if plan is None else [due for chain in plan.chains for due in due_of(chain)]
         ends = [(text, text.rpartition("..")[2]) for text in chains]
@@ -340,6 +373,7 @@ class Watch:
                     memory.lost = 0  # before the watch began
         for pid, process in self.processes.items():
             self._take(pid, process)
+        self.loops.look_at_cores(now)
         if now - self._tabled_ns > SECOND:
             self._take_fresh(now)
         # Processes that have ended stay until their last events are too old to be asked for.
@@ -389,10 +423,14 @@ class Watch:
         graph = graph_of(flow)
         for chain in self.chains:
             _forget(chain.hops, now - SPANS["minute"])
+            _forget(chain.ages, now - SPANS["minute"])
             traversed = self._judged(chain, flow, graph)
             if traversed is None:
                 continue
-            judged, hops = traversed
+            judged, hops, traversals = traversed
+            if chain.problem is None:
+                ages = _ages(flow, traversals, graph, (self._over_ns + 1, over))
+                chain.ages += [] if ages is None else [(now, ages)]
             begun = judged.filter(within)
             # A lifecycle node that is not active owes no output, nor does an older message.
             idle = pl.col("reason").is_in(OWES_NO_OUTPUT).fill_null(False)
@@ -406,6 +444,8 @@ class Watch:
             of_over = replace(flow, instances=flow.instances.filter(within))
             self.callbacks.append((now, longest_times(of_over)))
             _forget(self.callbacks, now - SPANS["minute"])
+        running = [process.pid for pid, process in self.processes.items() if pid not in ended]
+        missed = self.loops.take(flow, self._over_ns, over, offset, running)
         self._looked_from_ns, self._over_ns = self._over_ns, over
         return Seen(
             at_ns=now,
@@ -414,12 +454,14 @@ class Watch:
             chains=tuple(self._now(chain, over, moved) for chain in self.chains),
             callbacks=tuple(_callbacks([times for _, times in self.callbacks or ()])),
             left_out=tuple(self._left_out.values()),
+            loops=self.loops.now(),
+            missed=tuple(miss.text for miss in missed),
         )
 
     def _judged(
         self, watched: _Chain, flow: DataFlow, graph: ApplicationGraph
-    ) -> tuple[pl.DataFrame, pl.DataFrame] | None:
-        """Return the judged traversals of a chain, and their hops; None: the chain is not there.
+    ) -> tuple[pl.DataFrame, pl.DataFrame, Traversals] | None:
+        """Return the judged traversals of a chain, their hops, and all of them; None: no chain.
 
         Where only its beginning is in the graph, each cycle that began is incomplete.
         """
@@ -439,14 +481,15 @@ class Watch:
         traversals = traverse(flow, chain, graph)
         judged, _ = with_punctuality(flow, traversals, self._due(chain.topics[-1]))
         if watched.problem is not None:
-            return judged.with_columns(latency_ns=None, late=None, complete=False), traversals.hops
+            judged = judged.with_columns(latency_ns=None, late=None, complete=False)
+            return judged, traversals.hops, traversals
         path = graph.path(chain)
         watched.first, watched.output = path[0], chain.topics[-1]
         watched.slots = self._slots(watched.output)  # the text may end with a node
         watched.names = [
             (callback.node or "", topic) for callback, topic in zip(path, chain.topics, strict=True)
         ]
-        return judged, traversals.hops
+        return judged, traversals.hops, traversals
 
     def _objects(self, tables: EventTables, since_ns: int) -> Objects:
         """Return the objects of all processes: those of the last look, if none can have come since.
@@ -486,7 +529,15 @@ class Watch:
             problem=chain.problem,
             outputs=outputs,
             kept=outputs.kept,
+            age=chain.age(),
         )
+
+    def unseen_loops(self) -> list[str]:
+        """Say which of the named loops have not been seen, and why."""
+        tables = self._tables(time.monotonic_ns() - RECORDER_NS)
+        notes = list(named_loops.notes(self._named_loops, tables))
+        remedy = f"If it was not started here, start it behind `{named_loops.STARTED_SO}`."
+        return [f"{note} {remedy}" for note in notes]
 
     @property
     def lost(self) -> int:
@@ -569,6 +620,27 @@ def _hops(chain: _Chain) -> Iterator[Hop]:
         yield Hop(node, topic, communication, computation, waiting, longest)
 
 
+def _ages(
+    flow: DataFlow, traversals: Traversals, graph: ApplicationGraph, between: tuple[int, int]
+) -> tuple[pl.DataFrame, pl.DataFrame] | None:
+    """Return what the chain's loop worked with in its cycles that began in a time; None: no loop.
+
+    The first frame has its cycles (``start``, ``traversal``, ``age_at_loop_ns``), the second the
+    messages that came (``traversal``, ``stored``). In both ``traversal`` is when it began, which
+    names it in each look alike.
+    """
+    age = data_age(flow, traversals, graph, between)
+    if age is None:
+        return None
+    begun = traversals.frame.select("traversal", begun="start")
+    cycles = age.cycles.join(begun, on="traversal", how="left", maintain_order="left")
+    messages = age.messages.join(begun, on="traversal", how="left", maintain_order="left")
+    return (
+        cycles.select("start", "age_at_loop_ns", traversal="begun"),
+        messages.select("stored", traversal="begun"),
+    )
+
+
 def _callbacks(looks: Sequence[Mapping[tuple[str, str], Longest]]) -> Iterator[CallbackNow]:
     """Yield the longest times of each callback over some looks, by node and what starts it."""
     for node, starts in dict.fromkeys(name for times in looks for name in times):
@@ -637,6 +709,10 @@ _METRICS = {
     "chain.latency": ("gauge", "s", "End-to-end latency of a chain over a span"),
     "hop.time": ("gauge", "s", "Mean share of a hop over the last minute"),
     "chain.cycles": ("counter", "1", "Cycles of a chain by outcome"),
+    "loop.period": ("gauge", "s", "Period of a loop over the last minute"),
+    "loop.start_jitter": ("gauge", "s", "Jitter of a loop's starts over the last minute"),
+    "loop.overruns": ("gauge", "1", "Share of a loop's instances that overran in the last minute"),
+    "loop.misses": ("gauge", "1", "Instances of a loop that missed its rate in the last minute"),
     "events.lost": ("counter", "1", "Events that were overwritten before they were read"),
 }
 
@@ -644,6 +720,15 @@ _METRICS = {
 def _values(seen: Seen) -> Iterator[tuple[str, float, dict[str, str]]]:
     """Yield each value of :data:`_METRICS`, with its name and attributes."""
     yield "events.lost", float(seen.lost), {}
+    for loop in seen.loops:
+        of_loop = {"loop": loop.loop}
+        times = {"period": loop.rate.period_ns, "start_jitter": loop.rate.start_jitter_ns}
+        for figure, time_ns in times.items():
+            if time_ns is not None:
+                yield f"loop.{figure}", time_ns / SECOND, of_loop
+        if loop.rate.overrun_share is not None:
+            yield "loop.overruns", loop.rate.overrun_share, of_loop
+        yield "loop.misses", float(loop.misses), of_loop
     for chain in seen.chains:
         named = {"chain": chain.chain}
         for span, figures in chain.spans.items():

@@ -137,7 +137,7 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
                 (pl.col(end) + info.clock_offset_ns).alias(f"{end}_ns")
                 for end in ("start", "publish", "end")
             ]
-            ages = ("age_at_loop_ns", "age_at_end_ns", "use")
+            ages = ("age_at_loop_ns", "age_at_end_ns", "use", "ambiguous")
             result["loop_cycles"] = analysis.data_age.cycles.select(*times, *ages).to_dicts()
     return result
 
@@ -207,6 +207,7 @@ def data_age_json(age: DataAge | None) -> dict[str, Any] | None:
         "at_loop": asdict(latency_statistics(known["age_at_loop_ns"])),
         "at_end": asdict(latency_statistics(at_end, incomplete=known.height - at_end.len())),
         "messages": {**age.uses, "most_uses": age.most_uses},
+        "ambiguous": age.ambiguous,
     }
 
 
@@ -220,6 +221,11 @@ def data_age_table(age: DataAge) -> ResultTable:
         f"Messages used once: {once}; in several cycles: {again}{repeats}; never: {never}. That a"
         " cycle uses the newest message is inferred; no event shows it."
     )
+    if age.ambiguous:
+        below += (
+            f" In {age.ambiguous} of {age.cycles.height} cycles a message was being stored between"
+            " wake-up and output: whether they used it, or the one before, cannot be told."
+        )
     title = f"Age of the data of {age.loop.label}, over all of its cycles [ms]"
     table = ResultTable(title, [*words(""), *figures("at the loop", "at the end")], below)
     for name, cells in _rows([latency_statistics(column) for column in columns]).items():

@@ -53,7 +53,8 @@ from chainshaper.verify.measure import PARTS, Measurement
 
 if TYPE_CHECKING:  # only the verbs `watch` and `budget` need these modules
     from chainshaper.monitor.budgets import Judged
-    from chainshaper.monitor.watch import Seen
+    from chainshaper.monitor.watch import AgeNow, Seen
+    from chainshaper.monitor.watched_loops import LoopNow
 
 UNKNOWN = "unknown"
 COLOURS = {"good": "green", "limited": "yellow", "absent": "red"}
@@ -605,7 +606,7 @@ def runs_table(runs: Iterable[tuple[Journal, RunState | None]]) -> ResultTable:
 
 
 def watch_tables(seen: "Seen") -> list[ResultTable]:
-    """Make two tables of each watched chain: latencies over its spans, and its hops."""
+    """Make tables of each watched chain, its spans, hops and data's age; and one of all loops."""
     nodes = ", ".join(sorted(filter(None, seen.processes.values()))) or "no node"
     tables = []
     for chain in seen.chains:
@@ -642,6 +643,10 @@ def watch_tables(seen: "Seen") -> list[ResultTable]:
             for hop in chain.hops:
                 hops.add(hop.node, hop.topic, *(ms(getattr(hop, f"{part}_ns")) for part in PARTS))
             tables.append(hops)
+        if chain.age is not None:
+            tables.append(_age_now_table(chain.age))
+    if seen.loops or not tables:
+        tables.append(_loops_now_table(seen.loops))
     lost = f"; {seen.lost} events lost" if seen.lost else ""
     if unclear := sum(chain.counted["unclear"] for chain in seen.chains):
         lost += f"; {unclear} cycles unclear: the clock was set"
@@ -651,6 +656,40 @@ def watch_tables(seen: "Seen") -> list[ResultTable]:
     problem = tables[-1].caption
     tables[-1].caption = f"{problem}; {nodes}{lost}" if problem else f"{nodes}{lost}"
     return tables
+
+
+def _age_now_table(age: "AgeNow") -> ResultTable:
+    """Make a table of the age of a loop's data over the last minute."""
+    names = ("cycles", "min", "p50", "p99", "max", "jitter", "never used", "used again")
+    table = ResultTable("", [*words("age at the loop [ms]"), *figures(*names)])
+    ages = age.at_loop
+    middle = (ages.percentiles_ns.get(name) for name in ("50", "99"))
+    times = (ages.min_ns, *middle, ages.max_ns, ages.jitter_ns)
+    shares = ("" if share is None else percent(share) for share in (age.never, age.again))
+    table.add("last minute", ages.count, *map(ms, times), *shares)
+    return table
+
+
+def _loops_now_table(loops: "Sequence[LoopNow]") -> ResultTable:
+    """Make a table of how loops kept their rate over the last minute."""
+    names = ("instances", "period", "jitter of start", "overruns", "missed its rate")
+    problems = "; ".join(f"{loop.loop}: {loop.problem}" for loop in loops if loop.problem)
+    nothing = "no loop has been seen" if not loops else None
+    table = ResultTable(
+        "Loops, over the last minute [ms]", [*words("loop"), *figures(*names)], problems or nothing
+    )
+    for loop in loops:
+        rate = loop.rate
+        overruns = "" if rate.overruns is None else rate.overruns
+        table.add(
+            loop.loop,
+            rate.count,
+            ms(rate.period_ns),
+            ms(rate.start_jitter_ns),
+            overruns,
+            loop.misses,
+        )
+    return table
 
 
 def fleet_table(judged: "Sequence[Sequence[Judged]]") -> ResultTable:
@@ -669,7 +708,7 @@ def broken_table(broken: "Sequence[Judged]") -> ResultTable:
     columns = [*words("recording", "where", "limit"), *figures("budget", "found")]
     table = ResultTable("Limits that are broken", [*columns, *words("because")])
     for judged in broken:
-        shown = percent if judged.figure == "missing" else ms
+        shown = percent if judged.is_share else ms
         values = shown(judged.limit), shown(judged.measured)
         table.add(judged.recording, judged.where, judged.figure, *values, judged.because or "")
     return table

@@ -566,6 +566,7 @@ SLEEPING_CALLS = (
     "select",  # and pselect; `time.sleep` of Python before 3.11
     "timerfd",  # read of a timer's file
     "rmw_wait",  # an executor waits for work, in a thread that publishes outside callbacks
+    "pthread_cond_wait",  # without a time: another thread paces it
 )
 
 _OURS = (

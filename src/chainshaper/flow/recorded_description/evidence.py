@@ -66,12 +66,6 @@ def evidence_of(recording: Recording, chain: str | None) -> Evidence:
     if heaviest is None:
         raise InputError(f"{recording.path}: no chain is in it, see `chainshaper graph`")
     path = find_chain(graph, chain or recording.info.chain or heaviest.spec)
-    if path.topics[-1].endswith(LOOP_END):
-        raise InputError(
-            f"{recording.path}: the chain {path.spec} ends with an instance of a loop, and loops"
-            " are not described from recordings: give a chain to what the loop reads (--chain), and"
-            " add the loop by hand"
-        )
     counting = publication_that_counts(flow, frozenset(path.topics))
     occupied = occupation(flow, recording.info, counting)
     callbacks = {callback.id: callback for callback in graph.callbacks}

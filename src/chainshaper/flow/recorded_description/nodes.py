@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cmp_to_key, partial
 from itertools import count
@@ -17,11 +17,12 @@ from chainshaper.analysis.graph import MESSAGE_FILTER
 from chainshaper.flow.recorded_description.costs import delivery_times
 from chainshaper.flow.recorded_description.evidence import Evidence, own_topics
 from chainshaper.flow.recorded_description.timers import Expiry, blocker_of, expiry_of
-from chainshaper.values.application import INTERNAL_TOPICS, Callback
+from chainshaper.values.application import INTERNAL_TOPICS, LOOP_END, Callback
 from chainshaper.values.durations import duration_text, format_duration
 
 Numbers = npt.NDArray[np.int64]
 
+_SHORTEST_TURN_NS = 1_000  # an instance of a described loop takes some time
 _UNEXPLAINED = 0.05  # the share of a synchroniser's sets that may be completed by chance elsewhere
 
 
@@ -41,19 +42,38 @@ class DescribedNode:
     callbacks: list[DescribedCallback] = field(default_factory=list)
     deliveries: dict[str, Numbers] = field(default_factory=dict)  # by topic (ns)
     values: dict[str, Any] = field(default_factory=dict)  # but for its callbacks
+    stored: list[int] = field(default_factory=list)  # callbacks that store what its loop reads
 
     @property
     def ids(self) -> list[int]:
         """Those of all its callbacks."""
         return [number for callback in self.callbacks for number in callback.ids]
 
+    @property
+    def loop(self) -> DescribedCallback | None:
+        """Its loop, which has a thread of its own; None: it has none."""
+        return next((callback for callback in self.callbacks if "loop" in callback.values), None)
+
+    @property
+    def of_executor(self) -> list[int]:
+        """Ids of the callbacks that its executor runs; of a node with a loop alone, the loop's."""
+        loop = () if self.loop is None else self.loop.ids
+        ids = [number for number in self.ids if number not in loop]
+        return [*ids, *self.stored] or self.ids
+
 
 def described_nodes(evidence: Evidence) -> dict[str, DescribedNode]:
     """Return the nodes with the callbacks that ran, in the order of the graph."""
-    seen: set[int] = set()
+    loops = _loops(evidence)
+    seen = {
+        store.id
+        for loop, stores in loops.items()
+        for store in stores
+        if store.node == evidence.callbacks[loop].node
+    }
     chosen: list[tuple[int, ...]] = []
     for callback in evidence.callbacks.values():
-        if callback.id in seen or not _describable(callback):
+        if callback.id in seen or not (callback.id in loops or _describable(callback)):
             continue
         members = _inputs(evidence, callback)
         seen |= {*members}
@@ -66,7 +86,13 @@ def described_nodes(evidence: Evidence) -> dict[str, DescribedNode]:
     for members in chosen:
         first = evidence.callbacks[members[0]]
         node = nodes.setdefault(names[first.node, first.pid], DescribedNode())
-        node.callbacks.append(_described(evidence, node, members, published))
+        stores = loops.get(first.id)
+        described = (
+            _described(evidence, node, members, published)
+            if stores is None
+            else _described_loop(evidence, node, first, stores, published)
+        )
+        node.callbacks.append(described)
     for node in nodes.values():
         _sort_by_turn(evidence, node)
     calls = {
@@ -119,9 +145,79 @@ def described_chain(evidence: Evidence, nodes: Mapping[str, DescribedNode]) -> s
             named |= {known_by: f"/{name}", known_by.removeprefix("/"): f"/{name}"}
     topics = {topic for callback in evidence.callbacks.values() for topic in callback.publishes}
     points = parse_chain(evidence.chain.spec)
-    return "..".join(
-        point if {point, f"/{point}"} & topics else named.get(point, point) for point in points
-    )
+    return "..".join(_point(point, topics, named) for point in points)
+
+
+def _point(point: str, topics: Collection[str], named: Mapping[str, str]) -> str:
+    """Return a chain's way point by the name that it has in the description."""
+    if point.endswith(LOOP_END):
+        node = point.removesuffix(LOOP_END)
+        return named.get(node, node) + LOOP_END
+    return point if {point, f"/{point}"} & {*topics} else named.get(point, point)
+
+
+def _loops(evidence: Evidence) -> dict[int, list[Callback]]:
+    """Return the loops that a description can have, with the callbacks that store what they read.
+
+    They have a period, and an output or an input. A node has one loop there: others are described
+    as timers.
+    """
+    loops = dict[int, list[Callback]]()
+    nodes = set[tuple[str, int]]()
+    for loop in evidence.callbacks.values():
+        if loop.kind != "loop" or not loop.period_ns:
+            continue
+        stores = [
+            store
+            for store in evidence.callbacks.values()
+            if (store.kind, store.pid) == ("subscription", loop.pid)
+            and store.topic not in INTERNAL_TOPICS
+            and {*store.passes_on}.intersection(loop.publishes)
+        ]
+        if (loop.node, loop.pid) in nodes or not (stores or own_topics(loop)):
+            continue
+        nodes.add((loop.node, loop.pid))
+        loops[loop.id] = list({store.topic: store for store in stores}.values())
+    return loops
+
+
+def _described_loop(
+    evidence: Evidence,
+    node: DescribedNode,
+    loop: Callback,
+    stores: Sequence[Callback],
+    published: Collection[str],
+) -> DescribedCallback:
+    """Describe a loop, and what it reads: ``stores`` are the callbacks that store its inputs."""
+    instances = evidence.instances([loop.id])
+    described = DescribedCallback((loop.id,), {})
+    timing = _timer_values(evidence, described, loop, instances)
+    described.values["loop"] = timing.pop("timer")
+    described.values |= timing
+    reads = [store for store in stores if store.topic in published]
+    if unknown := [str(store.topic) for store in stores if store.topic not in published]:
+        evidence.notes.append(
+            f"{loop.label} also reads {', '.join(unknown)}, which nothing described publishes: it"
+            " does not in the description."
+        )
+    for store in reads:
+        _instances_by_message(evidence, node, store)
+    if reads:
+        described.values["reads"] = [str(store.topic) for store in reads]
+    node.stored += [store.id for store in reads]
+    rows: Numbers = instances["instance"].to_numpy().astype(np.int64)
+    before, after = _execution_times(evidence, loop, rows)
+    described.values["execution"] = before.clip(_SHORTEST_TURN_NS)
+    if topics := own_topics(loop):
+        described.values["publishes"] = topics
+        if after.any():
+            described.values["afterwards"] = after
+        if silent := int(instances["published"].null_count()):
+            evidence.notes.append(
+                f"{loop.label} published nothing in {silent} of {len(instances)} instances: in the"
+                " description it publishes in all."
+            )
+    return described
 
 
 def _describable(callback: Callback) -> bool:
@@ -270,7 +366,7 @@ def _timer_values(
     A callback that nothing described triggers has those of its starts.
     """
     period, expiry_ns = _noted_expiry(evidence, callback, instances)
-    if callback.kind != "timer":
+    if callback.kind != "timer" and callback.id not in _loops(evidence):
         evidence.notes.append(
             f"{callback.label} is started by nothing that is described: in the description a timer"
             f" starts it, every {duration_text(period)}."

@@ -20,7 +20,7 @@ _REAL_TIME = ("SCHED_FIFO", "SCHED_RR")
 
 def described_scheduling(evidence: Evidence, nodes: Mapping[str, DescribedNode]) -> dict[str, Any]:
     """Return the scheduling of most nodes and of DDS threads; add what differs to the nodes."""
-    threads = {name: _threads(evidence, node) for name, node in nodes.items()}
+    threads = {name: _threads(evidence, node.of_executor) for name, node in nodes.items()}
     bound = {name: _core_of(evidence, of_node) for name, of_node in threads.items()}
     priorities = _priorities(evidence, threads)
     dds = _dds_scheduling(evidence)
@@ -43,6 +43,7 @@ def described_scheduling(evidence: Evidence, nodes: Mapping[str, DescribedNode])
             node.values["core"] = core
             core_of_thread |= dict.fromkeys(threads[name], core)
         node.values["priority"] = priorities[name]
+    _add_loops(evidence, nodes, free)
     if roaming:
         evidence.notes.append(
             f"The threads of {', '.join(roaming)} are bound to no core that the recording shows:"
@@ -60,10 +61,32 @@ def described_scheduling(evidence: Evidence, nodes: Mapping[str, DescribedNode])
     return {"executors": {"core": usual_core, "priority": usual_priority}, "dds": dds}
 
 
-def _threads(evidence: Evidence, node: DescribedNode) -> list[ThreadKey]:
-    """Return the threads that ran a node's callbacks."""
-    ran = evidence.instances(node.ids).select("pid", "tid").unique(maintain_order=True)
+def _threads(evidence: Evidence, ids: Sequence[int]) -> list[ThreadKey]:
+    """Return the threads that ran some callbacks."""
+    ran = evidence.instances(ids).select("pid", "tid").unique(maintain_order=True)
     return [(int(pid), int(tid)) for pid, tid in ran.iter_rows()]
+
+
+def _add_loops(evidence: Evidence, nodes: Mapping[str, DescribedNode], free: Iterator[int]) -> None:
+    """Add core and priority of loops' threads, where they are not those of the executor."""
+    looping = {name: node for name, node in nodes.items() if node.loop is not None}
+    threads = {
+        name: _threads(evidence, [] if node.loop is None else node.loop.ids)
+        for name, node in looping.items()
+    }
+    said = len(evidence.notes)
+    priorities = _priorities(evidence, threads) if threads else {}
+    del evidence.notes[said:]  # of their nodes' executors the same was said
+    for name, node in looping.items():
+        if node.loop is None or {*threads[name]} <= {*_threads(evidence, node.of_executor)}:
+            continue
+        core = _core_of(evidence, threads[name])
+        if core is None or "core" not in node.values:
+            core = next(free)
+        if core != node.values.get("core"):
+            node.loop.values["core"] = core
+        if priorities[name] != node.values["priority"]:
+            node.loop.values["priority"] = priorities[name]
 
 
 def _core_of(evidence: Evidence, threads: Sequence[ThreadKey]) -> int | None:
@@ -133,7 +156,7 @@ def _dds_scheduling(evidence: Evidence) -> dict[str, int]:
 
 def _add_executor(evidence: Evidence, node: DescribedNode, threads: Sequence[ThreadKey]) -> None:
     """Say that a node has several threads, where its callbacks ran at the same time."""
-    ran = evidence.instances(node.ids).drop_nulls("end").sort("start")
+    ran = evidence.instances(node.of_executor).drop_nulls("end").sort("start")
     if len(threads) < 2 or ran.is_empty():
         return
     overlaps = _overlaps(ran)
@@ -144,6 +167,8 @@ def _add_executor(evidence: Evidence, node: DescribedNode, threads: Sequence[Thr
     node.values |= {"executor": "multi_threaded", "threads": int(max(2, running.max()))}
     groups, kinds = list[set[int]](), dict[str, str]()
     for described in node.callbacks:
+        if described is node.loop:
+            continue
         ids = {*described.ids}
         if any((first, second) in overlaps for first in ids for second in ids):
             kinds["beside_itself"] = "reentrant"

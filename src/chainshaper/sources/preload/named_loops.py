@@ -40,6 +40,27 @@ def names_text(names: Sequence[str]) -> str:
     return text
 
 
+def variables(names: Sequence[str]) -> dict[str, str]:
+    """Return the variable that names loops in what is started with it; empty: none is named.
+
+    Raises InputError: as :func:`names_text`.
+    """
+    return {VARIABLE: names_text(names)} if names else {}
+
+
+def not_named(names: Sequence[str], tables: events.EventTables) -> list[str]:
+    """Return the loops that no process met that runs already with the library in front.
+
+    The library reads the names when its process starts.
+    """
+    met = events.table(tables, "loop_named")["name"]
+    return [name for name in dict.fromkeys(names) if name not in met]
+
+
+STARTED_SO = 'eval "$(chainshaper watch --environment --loop NAME)"'
+"""Names a loop in all that is started behind it."""
+
+
 def notes(names: Sequence[str], tables: events.EventTables) -> Iterator[str]:
     """Say which of the named loops were not seen, and why."""
     seen = events.table(tables, "loop_named")

@@ -76,6 +76,7 @@
 #define OBJECT_RECORDS (1u << 15)
 #define LONGEST_TEXT 4096u
 #define TEXT_BYTES 40u  // in one record
+#define MOST_NESTED 8u  // callbacks, one within the other, of which it is known where they began
 enum { TEXT = 1, LIBRARY = 2, FIRST_EVENT = 3 };
 
 struct record {
@@ -135,8 +136,12 @@ static __thread struct {
   bool publishes;          // it has published outside callbacks
   bool is_named;           // the user named it as a loop
   bool sleeps;             // it is in a function that we stand in front of, of which the sleep is recorded
-  int callbacks;           // that run in it, one within the other
-  uint16_t latest;         // event
+  unsigned callbacks;      // that run in it, one within the other
+  struct {                 // the first MOST_NESTED of them
+    uint64_t handle;
+    uintptr_t frame;  // of the stack, where it was announced
+  } callback[MOST_NESTED];
+  uint16_t latest;  // event
 } thread;
 
 static inline uint64_t now(clockid_t clock) {
@@ -177,7 +182,7 @@ static struct {
 static _Atomic ptrdiff_t rseq_offset;  // of the area from the thread pointer; 0: do without it
 
 static struct rseq_area *rseq_at(ptrdiff_t offset) {
-  char *thread_pointer;
+  char *thread_pointer = NULL;
   THREAD_POINTER(thread_pointer);
   struct rseq_area *area = (struct rseq_area *)(void *)(thread_pointer + offset);
   return thread_pointer && offset && (int32_t)area->cpu_id >= 0 ? area : NULL;
@@ -524,12 +529,47 @@ static void note_creation(unsigned event, const uint64_t *values) {
     created_publisher(values[0], (const char *)(uintptr_t)values[3]);
 }
 
+// Callbacks whose end is never announced (they threw an exception, which a loop around its executor
+// caught) would count for ever as running. What runs inside a callback lies deeper on the stack than
+// the call that announced it, at lower addresses: so of whatever is called from further up, or from
+// where another one is announced now, it is known that they are over.
+#define HERE ((uintptr_t)__builtin_frame_address(0))
+
+static inline void forget_over(uintptr_t frame) {
+  while (thread.callbacks && thread.callbacks <= MOST_NESTED &&
+         thread.callback[thread.callbacks - 1].frame < frame)
+    thread.callbacks--;
+}
+
+static inline void began_callback(uint64_t handle, uintptr_t frame) {
+  forget_over(frame + 1);
+  if (thread.callbacks < MOST_NESTED) {
+    thread.callback[thread.callbacks].handle = handle;
+    thread.callback[thread.callbacks].frame = frame;
+  }
+  thread.callbacks++;
+}
+
+static inline void ended_callback(uint64_t handle) {
+  if (thread.callbacks > MOST_NESTED) {
+    thread.callbacks--;
+    return;
+  }
+  for (unsigned place = thread.callbacks; place-- > 0;)
+    if (thread.callback[place].handle == handle) {
+      thread.callbacks = place;
+      return;
+    }
+}
+
 // From its first publication outside callbacks on a thread's sleeps are recorded.
-static inline void note(unsigned event, uint64_t handle) {
-  if (event == number_callback_start) thread.callbacks++;
-  if (event == number_callback_end && thread.callbacks) thread.callbacks--;
+static inline __attribute__((always_inline)) void note(unsigned event, uint64_t handle) {
+  if (event == number_callback_start) began_callback(handle, HERE);
+  if (event == number_callback_end) ended_callback(handle);
   bool publishes = event == number_rcl_publish || event == number_rclcpp_intra_publish;
-  if (!publishes || thread.publishes || thread.callbacks || *PLACE(handle) == handle) return;
+  if (!publishes || thread.publishes || *PLACE(handle) == handle) return;
+  if (thread.callbacks) forget_over(HERE);
+  if (thread.callbacks) return;
   thread.publishes = true;
   write_record(number_thread_wake, 0, 1, (uint64_t[6]){0}, true);
 }
@@ -705,8 +745,10 @@ static uint64_t at_either(const struct timespec *time) {
 
 // Whether the sleeps of this thread are recorded. Of the other threads of a process whose node is
 // named, only those count that can do nothing but sleep: executors wait as well.
-static bool is_followed(int call) {
-  if (!memory || !*memory_is_ours || thread.callbacks || thread.sleeps) return false;
+static bool is_followed(int call, uintptr_t frame) {
+  if (!memory || !*memory_is_ours || thread.sleeps) return false;
+  if (thread.callbacks) forget_over(frame);
+  if (thread.callbacks) return false;
   if (thread.publishes || thread.is_named) return true;
   if (names_threads) {
     char name[THREAD_NAME] = "";
@@ -736,17 +778,19 @@ static void end_sleep(int call) {
 // may be called in a signal's handler, where looking up is not allowed. Only what is called still
 // earlier, by a library that is loaded before ours, looks it up itself. A program that looks for a
 // function that its C library does not have finds ours, and is told that the kernel lacks it.
+// NOLINTBEGIN(bugprone-macro-parentheses): in brackets a type, or a list of parameters, is none.
 #define LIBC(type, name, parameters) \
   static type(*_Atomic behind_##name) parameters; \
   __attribute__((constructor)) static void find_##name(void) { \
     behind_##name = (type(*) parameters)dlsym(RTLD_NEXT, #name); \
   }
+// NOLINTEND(bugprone-macro-parentheses)
 #define IS_MISSING(name) (!behind_##name && (find_##name(), !behind_##name))
 
 // Whether a sleep is recorded. What the call finds in errno is what the program left there.
 #define BEGINS(call, until) ({ \
     int before = errno; \
-    bool begins = is_followed(call) && begin_sleep(call, until); \
+    bool begins = is_followed(call, HERE) && begin_sleep(call, until); \
     errno = before; \
     begins; \
   })
@@ -838,6 +882,25 @@ int pthread_cond_timedwait(pthread_cond_t *condition, pthread_mutex_t *mutex, ti
   const void *caller = __builtin_return_address(0);
   bool recorded = BEGINS(call, is_of_interpreter(caller) ? NO_SLEEP : at_either(time));
   int result = behind_pthread_cond_timedwait(condition, mutex, time);
+  if (recorded) end_sleep(call);
+  return result;
+}
+
+// A thread that waits without a time is paced by whoever signals the condition.
+static int (*_Atomic behind_pthread_cond_wait)(pthread_cond_t *, pthread_mutex_t *);
+
+__attribute__((constructor)) static void find_pthread_cond_wait(void) {
+  void *function = dlvsym(RTLD_NEXT, "pthread_cond_wait", "GLIBC_2.3.2");  // as above
+  if (!function) function = dlsym(RTLD_NEXT, "pthread_cond_wait");
+  behind_pthread_cond_wait = (int (*)(pthread_cond_t *, pthread_mutex_t *))function;
+}
+
+int pthread_cond_wait(pthread_cond_t *condition, pthread_mutex_t *mutex) {
+  if (IS_MISSING(pthread_cond_wait)) return ENOSYS;
+  const int call = sleeps_by_pthread_cond_wait;
+  const void *caller = __builtin_return_address(0);
+  bool recorded = BEGINS(call, is_of_interpreter(caller) ? NO_SLEEP : 0);
+  int result = behind_pthread_cond_wait(condition, mutex);
   if (recorded) end_sleep(call);
   return result;
 }

@@ -71,6 +71,7 @@ class PreloadTracer:
             if not self._processes:
                 why = "; ".join(sentence.rstrip(".") for sentence in self._refused) or NO_PROCESS
                 raise OperationError(f"{why}, or attach with `--source ebpf`")
+            self._refuse_unnamed()
             for process in self._processes:  # what happened until now is none of this recording
                 process.new_records()
                 process.lost = 0
@@ -83,6 +84,19 @@ class PreloadTracer:
         self._socket.settimeout(_BETWEEN_LOOKS_S)
         self._reader.start()
         return {**in_front(library), VARIABLE: name, named_loops.VARIABLE: self._loops_text}
+
+    def _refuse_unnamed(self) -> None:
+        """Refuse loops that the processes were not started with: only then their sleeps are seen.
+
+        Raises InputError.
+        """
+        created = [creation_tables(process)[0] for process in self._processes if self._loops]
+        if missing := named_loops.not_named(self._loops, joined_tables(created)):
+            raise InputError(
+                f"no process that runs has met the loop {', '.join(missing)}: names are read when a"
+                f" process starts, so start the robot behind `{named_loops.STARTED_SO}`; or the"
+                " name is wrong: `chainshaper graph` shows nodes, `ps -eLo pid,comm` threads"
+            )
 
     def failure(self) -> str | None:
         return self._failure
