@@ -1,0 +1,313 @@
+"""A chain's output and the loop that uses it, kept in step while they run.
+
+A loop samples a shaped output at a phase of its own, which is another one at each start, and drifts
+where its clock is not the chain's. So both are followed, and one of them is moved:
+
+* the **output**: its slots are moved later within the cycle, so that it leaves a given time, the
+  lead, before the loop starts next. The loop is not touched. Where the clocks drift apart, what the
+  loop reads gets older, or newer, with the drift, until the output is moved by a whole step.
+* the **loop**: its sleeps are moved (:mod:`chainshaper.sources.preload.moving`), so that it starts
+  the lead behind the output, which stays in its slots. The age of what it reads is constant, also
+  where the clocks drift.
+
+Both repeat in time; what they have in common is the greatest common divisor of their periods, the
+**step**: at this distance the chain's output may be placed in the same relation to a start of the
+loop. Moves are of less than a step, and later ones small, as the drift has it.
+"""
+
+import math
+import os
+import threading
+import time
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, Protocol, TypeAlias
+
+from chainshaper.analysis.loop_phase import LoopPhase, PhaseTrack, phase_of
+from chainshaper.enforcement.undoing import LoopStep
+from chainshaper.linux.threads import list_threads
+from chainshaper.planning.chain_plan import ChainPlan, publish_slots
+from chainshaper.planning.offsets import chain_name
+from chainshaper.sources.preload.moving import LoopMoved, LoopMover
+from chainshaper.splicing.shaped_outputs import FollowedOutput
+from chainshaper.values.durations import duration_text
+from chainshaper.values.errors import ChainshaperError, OperationError
+
+Moves: TypeAlias = Literal["output", "loop"]
+TOLERANCE_NS = 30_000  # nothing is moved for less
+LOOK_S = 0.1
+STEPS = 50  # so many of the latest moves are shown
+_ORIGINS_NS = 20_000_000_000  # of the chain's origins, none is older
+_SEARCH_EVERY = 10  # looks from one search for the loop to the next
+
+
+class LoopStarts(Protocol):
+    """A loop's thread that is followed, and perhaps moved: as :class:`.LoopMover`."""
+
+    @property
+    def is_there(self) -> bool: ...
+    def seen(self) -> tuple[list[int], list[LoopMoved]]: ...
+    def move(self, move_ns: int, period_ns: int) -> int: ...
+    def renew(self) -> None: ...
+    def close(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class StepWish:
+    """Which loop is to be in step with a chain's output. Times are ns.
+
+    * ``node``: of the loop.
+    * ``period_ns``: of the loop, as planned.
+    * ``lead_ns``: how long before a start of the loop the output leaves its slot.
+    * ``moves``: what is moved.
+    """
+
+    node: str
+    period_ns: int
+    lead_ns: int
+    moves: Moves
+    tolerance_ns: int = TOLERANCE_NS
+
+
+def step_of(period_ns: int, cycle_ns: int) -> int:
+    """Return the distance at which an output has the same relation to a loop's starts (ns)."""
+    return math.gcd(period_ns, cycle_ns)
+
+
+def next_move(
+    now_ns: int, wanted_ns: int, step_ns: int, range_ns: tuple[int, int], tolerance_ns: int
+) -> int:
+    """Return by how much to move, so that it is a wanted move but for whole steps.
+
+    ``now_ns`` is the move in force, and is returned where it is near enough. ``range_ns`` has the
+    smallest and the largest possible. Of those in the range the nearest is chosen; where none is,
+    the smallest possible one: what comes later than wanted loses nothing.
+
+        >>> next_move(0, 13, 10, (0, 9), 1)
+        3
+        >>> next_move(9, 10, 10, (0, 9), 0)
+        0
+        >>> next_move(5, 26, 10, (0, 9), 2)
+        5
+    """
+    least, most = range_ns
+    off = (wanted_ns - now_ns + step_ns // 2) % step_ns - step_ns // 2
+    if abs(off) <= tolerance_ns and least <= now_ns <= most:
+        return now_ns
+    moved = now_ns + off
+    if not least <= moved <= most:
+        moved = least + (moved - least) % step_ns
+    return moved if moved <= most else least
+
+
+@dataclass
+class OwnStarts:
+    """When a loop would have started by itself: its starts without what it was moved by."""
+
+    moves: list[LoopMoved] = field(default_factory=list)  # the latest ones
+    moved_ns: int = 0  # by now
+
+    def of(self, starts_ns: Sequence[int], moves: Sequence[LoopMoved]) -> list[int]:
+        """Return starts (ns, in order) without the moves before each of them."""
+        left, own = [*moves], list[int]()
+        for start in starts_ns:
+            while left and left[0].at_ns <= start:
+                self.moved_ns += left.pop(0).added_ns
+            own.append(start - self.moved_ns)
+        self.moved_ns += sum(move.added_ns for move in left)
+        self.moves = [*self.moves, *moves][-STEPS:]
+        return own
+
+
+class InStep:
+    """Keeps a chain's output and a loop in step, in a thread of its own, until it ends.
+
+    The thread may end by itself, with a ``failure``.
+
+    * ``steps``: what was moved, and why, the latest ones.
+    * ``loop``, ``chain``: where they are by now; None: not known yet.
+    * ``pids``: processes of which one may be the gate.
+    * ``reach_ns``: how far the output's slots may be moved later.
+    * ``find``: looks for the loop; it returns its starts until now as well, or None.
+    * ``put_in_force``: has servers move their slots by so much (ns), and returns from when on the
+      gate has to move its own.
+    * ``cores``: where the thread runs; none: anywhere.
+
+    Raises OperationError: see :class:`.FollowedOutput`.
+    """
+
+    def __init__(
+        self,
+        chain: ChainPlan,
+        wish: StepWish,
+        pids: Collection[int],
+        reach_ns: int,
+        find: Callable[[], LoopStarts | None],
+        put_in_force: Callable[[int], int],
+        *,
+        cores: Collection[int] = (),
+    ) -> None:
+        assert chain.shaping_node is not None  # noqa: S101 - else there is no slot to move
+        self.steps: tuple[LoopStep, ...] = ()
+        self.failure: ChainshaperError | None = None
+        self.chain, self.wish = chain, wish
+        self.step_ns = step_of(wish.period_ns, chain.cycle_ns)
+        self._slot_ns = publish_slots(chain)[-1][0]
+        self._reach_ns, self._find, self._put_in_force = reach_ns, find, put_in_force
+        self._output = FollowedOutput(chain.shaping_node.output, pids)
+        self._origins = PhaseTrack(chain.cycle_ns, _ORIGINS_NS)
+        self._loop: LoopStarts | None = None
+        self._loops, self._own, self._restarts = PhaseTrack(wish.period_ns), OwnStarts(), 0
+        self._moved_ns: int | None = None  # of what is moved; None: it was not, since it started
+        self._number = 0  # of the latest request to the loop
+        self._unreachable_ns = wish.period_ns  # from here on a move changes the loop's rate
+        self._looks = 0
+        self._cores, self._stop = cores, threading.Event()
+        self._thread = threading.Thread(target=self._follow, name="in-step", daemon=True)
+        self._thread.start()
+
+    @property
+    def loop_phase(self) -> LoopPhase | None:
+        """Where the loop would be by itself; None: not known yet."""
+        return self._loops.phase
+
+    @property
+    def age_ns(self) -> int | None:
+        """How old (ns, from the chain's origin) what the loop reads is to be; None: not yet known.
+
+        It is that of a reading just behind the lead; where only every so many of the loop's starts
+        have new data, that of the first of them.
+        """
+        loop, origin = self._loops.phase, self._origins.phase
+        if loop is None or origin is None or self._moved_ns is None:
+            return None
+        start = loop.near(origin.at_ns) + (self._moved_ns if self.wish.moves == "loop" else 0)
+        slot = self._slot_ns + (self._moved_ns if self.wish.moves == "output" else 0)
+        return slot + (start - origin.at_ns - slot) % self.step_ns
+
+    def end(self) -> None:
+        """Have all be where the plan and the loop have it, and follow no more."""
+        self._stop.set()
+        self._thread.join()
+        self._output.close()
+        if self._loop is not None:
+            self._loop.close()
+
+    def _follow(self) -> None:
+        if self._cores:
+            os.sched_setaffinity(0, self._cores)  # the calling thread's alone
+        try:
+            while not self._stop.wait(LOOK_S):
+                self.look()
+        except ChainshaperError as error:
+            if not self._stop.is_set():
+                self.failure = error
+        except Exception as error:  # a thread that ends in silence follows no more
+            self.failure = OperationError(f"following has failed ({type(error).__name__}: {error})")
+
+    def look(self) -> None:
+        """Look where both are, and move what is to be moved."""
+        self._looks += 1
+        self._origins.saw(self._output.origins(self.chain.cycle_ns))
+        self._look_at_loop()
+        loop, origin = self._loops.phase, self._origins.phase
+        if self._loop is None or loop is None or origin is None:
+            return
+        if self.wish.moves == "loop":
+            self._move_loop(self._loop, loop, origin)
+        else:
+            self._move_output(loop, origin)
+
+    def _look_at_loop(self) -> None:
+        """Read what the loop has done; look for it where it has ended."""
+        if self._loop is not None and not self._loop.is_there:
+            self._note(None, "the loop has ended: its phase is measured anew when it runs again")
+            self._loop = None
+        if self._loop is None:
+            if self._looks % _SEARCH_EVERY != 1:
+                return
+            self._loop = self._find()
+            self._loops, self._own = PhaseTrack(self.wish.period_ns), OwnStarts()
+            self._moved_ns = self._moved_ns if self.wish.moves == "output" else None
+            self._restarts, self._number = 0, 0
+            if self._loop is None:
+                return
+        starts, moves = self._loop.seen()
+        self._loops.saw(self._own.of(starts, moves))
+        if self._loops.restarts > self._restarts:
+            self._restarts = self._loops.restarts
+            self._note(None, "the loop starts elsewhere now: its phase is measured anew")
+        if self.wish.moves == "loop":
+            self._loop.renew()
+        for move in moves:
+            if move.why == "rate changed":
+                self._unreachable_ns = min(self._unreachable_ns, move.asked_ns)
+                self._moved_ns = 0
+                self._note(
+                    0,
+                    f"moved by {duration_text(move.asked_ns)} it left instances out: too little"
+                    " time is left for its work, so it is not moved so far any more",
+                )
+
+    def _move_loop(self, mover: LoopStarts, loop: LoopPhase, origin: LoopPhase) -> None:
+        output = origin.at_ns + self._slot_ns + self.wish.lead_ns
+        period_ns = round(loop.period_ns)
+        range_ns = (0, min(period_ns, self._unreachable_ns) - 1)
+        before = self._moved_ns
+        # The loop's place is that of its own starts; a small step follows a drift, a large one not.
+        wanted = output - loop.near(output)
+        moved = next_move(before or 0, wanted, self.step_ns, range_ns, self.wish.tolerance_ns)
+        if moved != before:
+            self._number = mover.move(moved, period_ns)
+            self._moved_ns = moved
+            self._note(moved, _why(before, moved, loop, origin, self.step_ns))
+
+    def _move_output(self, loop: LoopPhase, origin: LoopPhase) -> None:
+        before = self._moved_ns
+        wanted = loop.near(origin.at_ns) - self.wish.lead_ns - origin.at_ns - self._slot_ns
+        range_ns = (0, self._reach_ns)
+        moved = next_move(before or 0, wanted, self.step_ns, range_ns, self.wish.tolerance_ns)
+        if moved != before:
+            self._output.move(moved, self._put_in_force(moved))
+            self._moved_ns = moved
+            self._note(moved, _why(before, moved, loop, origin, self.step_ns))
+
+    def _note(self, moved_ns: int | None, why: str) -> None:
+        loop = self._loops.phase
+        step = LoopStep(
+            at_ns=time.monotonic_ns(),
+            chain=chain_name(self.chain),
+            loop=self.wish.node,
+            moves=self.wish.moves,
+            moved_ns=moved_ns,
+            drift_ppm=None if loop is None else round(loop.drift_ppm, 1),
+            why=why,
+        )
+        self.steps = (*self.steps, step)[-STEPS:]
+
+
+def _why(
+    before: int | None, moved: int, loop: LoopPhase, origin: LoopPhase, step_ns: int
+) -> str:
+    if before is None:
+        spread = duration_text(round(loop.spread_ns, -3))
+        return f"its phase was measured in {loop.starts} starts, which spread over {spread}"
+    if abs(moved - before) > step_ns // 2:
+        return "the drift has moved it to the end of what is possible, so it goes on a step further"
+    return f"the clocks drift apart by {loop.drift_ppm - origin.drift_ppm:+.1f} ppm"
+
+
+def find_loop(pid: int, period_ns: int, lease_ns: int = 5_000_000_000) -> LoopMover | None:
+    """Return the loop of a process that the library in front sees; None: no thread has the period.
+
+    What it had seen of the loop before is still to be taken with ``seen``.
+    """
+    for thread in list_threads(pid):
+        try:
+            mover = LoopMover(pid, thread.tid, lease_ns)
+        except OperationError:
+            continue
+        starts, _ = mover.seen()
+        if phase_of(starts[-200:], period_ns) is not None:
+            return LoopMover(pid, thread.tid, lease_ns)
+    return None
