@@ -23,13 +23,17 @@ from chainshaper.planning.chain_plan import (
     Adaptation,
     ChainOfPlan,
     Evidence,
+    LoopAge,
     Margin,
+    PlannedLoop,
     Prediction,
     Server,
     ShapingNode,
     Thread,
+    loop_common_ns,
     server_of,
 )
+from chainshaper.planning.overruns import cycles_until_output, slots_of_latency
 from chainshaper.planning.plan import Plan
 from chainshaper.values.errors import InputError, OperationError
 
@@ -166,14 +170,50 @@ WRONG_ADAPTATIONS = [
 ]
 
 
+LOOP = """\
+loop:
+  node: /controller
+  thread: update
+  topic: /t5
+  period: 50ms
+  phase: 14ms
+  jitter: 80us
+  drift_ppm: -12.5
+  samples: 640
+  delivery: [200us, 450us, 2ms]
+  lead: 600us
+  in_step: output
+  earliest_start: 64ms
+  realtime_priority: 50
+  runs_at: {core: 1, priority: 1, time: 300us}
+  age: {first: [114ms, 114.08ms], every: [114ms, 164.08ms], constant: true, uses: [2, 2]}
+  age_at_any_phase: {first: [64ms, 114.08ms], every: [64ms, 164.6ms], constant: false, uses: [1, 3]}
+"""
+WITH_LOOP = GOOD + LOOP
+WRONG_LOOPS = [  # as above, with the line in the loop
+    ("topic: /t5\n  period", "topic: /t6\n  period", 4, "loop.topic", "chain's output is /t5"),
+    ("period: 50ms", "period: 30ms", 12, "loop.in_step", "neither of its period 30 ms and"),
+    ("period: 50ms", "intervals: [1ms, 2ms, 3ms]", 12, "loop.in_step", "has no period"),
+    ("  period: 50ms\n  phase", "  phase", 1, "loop", "write its period, or the intervals"),
+    ("in_step: output", "in_step: loop", 13, "loop.earliest_start", "goes with in_step: output"),
+    ("earliest_start: 64ms", "move: 1ms", 1, "loop.earliest_start", "goes with in_step: output"),
+    ("in_step: output", "in_step: maybe", 12, "loop.in_step", "'output' or 'loop'"),
+    ("samples: 640", "samples: 0", 9, "loop.samples", "1"),
+]
+
+
 @pytest.mark.parametrize(
-    "case", [*WRONG_VALUES, *WRONG_MODES, *WRONG_ADAPTATIONS], ids=lambda case: case[1].strip()
+    "case",
+    [*WRONG_VALUES, *WRONG_MODES, *WRONG_ADAPTATIONS, *WRONG_LOOPS],
+    ids=lambda case: case[1].strip(),
 )
 def test_a_wrong_value_is_named(tmp_path: Path, case: tuple[str, str, int, str, str]) -> None:
     old, new, line, key, words = case
     text = ADAPTED if case in WRONG_ADAPTATIONS else GOOD
     if case in WRONG_MODES:
         text, line = WITH_MODES, line + WITH_MODES[: WITH_MODES.index("modes:")].count("\n")
+    if case in WRONG_LOOPS:
+        text, line = WITH_LOOP, line + GOOD.count("\n")
     assert old in text
     with pytest.raises(InputError) as caught:
         _load(tmp_path, text.replace(old, new, 1))
@@ -181,6 +221,29 @@ def test_a_wrong_value_is_named(tmp_path: Path, case: tuple[str, str, int, str, 
     line += FILE.count("\n")
     assert problem.startswith(f"{tmp_path / 'plan.yaml'}:{line}: chains[0].{key}: ")
     assert words in problem
+
+
+def test_a_loop_that_reads_the_output_is_part_of_the_plan(tmp_path: Path) -> None:
+    """In step, its output is due a cycle later where its slot begins before the chain is done."""
+    plan = _load(tmp_path, WITH_LOOP)
+    loop = plan.loop
+    assert loop is not None
+    assert (loop.period_ns, loop.stored_ns) == (50_000_000, (200_000, 600_000))
+    assert loop_common_ns(plan) == 50_000_000
+    assert loop.age.first_ns == (114_000_000, 114_080_000)
+    assert cycles_until_output(plan) == 0
+    before = GOOD.replace("[64000us, 0.065s]", "[13.4ms, 14.4ms]") + LOOP
+    assert cycles_until_output(_load(tmp_path, before)) == 1
+    assert slots_of_latency(_load(tmp_path, before)) == ((113_400_000, 114_400_000),)
+    assert _load(tmp_path, GOOD).loop is None
+    two_slots = WITH_LOOP.replace("- [64000us, 0.065s]", "- [40ms, 41ms]\n      - [64ms, 65ms]")
+    with pytest.raises(InputError, match=r"loop\.in_step: .* in one slot of the cycle"):
+        _load(tmp_path, two_slots)
+    irregular = WITH_LOOP.replace("period: 50ms", "intervals: [10ms, 20ms, 90ms]")
+    for line in ("in_step: output", "earliest_start: 64ms"):
+        irregular = irregular.replace(f"  {line}\n", "")
+    with pytest.raises(ValueError, match="no loop with a period"):
+        loop_common_ns(_load(tmp_path, irregular))
 
 
 def test_a_mode_publishes_in_a_slot_of_its_own(tmp_path: Path) -> None:
@@ -336,6 +399,18 @@ def plans(draw: st.DrawFn) -> ChainPlan:
     )
     chain = some(spec=st.text(), publisher=NAMES, output_depth=st.integers(1, 100))
     late, after = st.floats(1.1, 10), st.integers(1, 10**6)
+    age = LoopAge(first_ns=(1, 2), every_ns=(1, 3), constant=draw(any_bool), uses=(0, 7))
+    loop = PlannedLoop(
+        node="/n",
+        topic=output,
+        period_ns=draw(st.integers(1, 2**62)),
+        samples=3,
+        delivery_ns=(1, 2, 3),
+        lead_ns=draw(times),
+        drift_ppm=draw(st.floats(-1e6, 1e6)),
+        age=age,
+        **some(thread=st.text(min_size=1), phase_ns=times, age_at_any_phase=st.just(age)),
+    )
     return ChainPlan(
         chain=ChainOfPlan(output=output, period_ns=period, **chain),
         evidence=Evidence(samples=draw(st.integers(1, 10**12)), **latencies, **known),
@@ -356,6 +431,7 @@ def plans(draw: st.DrawFn) -> ChainPlan:
             fallback=st.sampled_from(["bypass", "silence"]),
             modes=modes(len(slots)),
             adaptation=st.builds(Adaptation, late=late, after=after),
+            loop=st.just(loop),
         ),
     )
 

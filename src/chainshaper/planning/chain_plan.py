@@ -14,6 +14,7 @@ locks with its process. With Fast DDS 2.14, three things are destructive and ref
 * a history too shallow for the messages that come while the thread may not run.
 """
 
+import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain, combinations, pairwise, product
@@ -71,6 +72,8 @@ FromOne = Annotated[int, Field(ge=1)]
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Slot: TypeAlias = tuple[Duration, Duration]
 """A time slot [start, end) of a cycle."""
+Range: TypeAlias = tuple[Duration, Duration]
+"""The lowest and the highest of some times."""
 Wrong: TypeAlias = Iterator[tuple[str | int, ...]]
 """What breaks a rule: for each place the reason, and behind it the place's keys in the file."""
 
@@ -239,6 +242,65 @@ class ReceiverPlace(Part):
     time_ns: Duration  # for so long in a cycle, at most, the plan leaves the core to them
 
 
+class LoopAge(Part):
+    """How old the data of a loop are when it reads them, since the start of the chain's cycle.
+
+    See :mod:`chainshaper.planning.loop_ages`.
+    """
+
+    first_ns: Range  # at the first use of a message, which is the reaction to it
+    every_ns: Range  # in all cycles of the loop, also those that use a message again
+    # Whether the first use comes at one age but for the jitter of the loop's start.
+    constant: bool
+    uses: tuple[Count, Count]  # in how many cycles a message is used: the fewest, and the most
+
+
+class PlannedLoop(Part):
+    """A loop that reads the shaped output, and what is planned for it.
+
+    What is measured anew at each start of the loop stands here as it was in the recording:
+    ``phase_ns``, with all that follows from it, which is ``age`` and, in step with the output, the
+    output's slot.
+    """
+
+    node: FullName  # whose loop it is
+    thread: Annotated[str, Field(min_length=1)] | None = None  # its thread's name; None: not known
+    topic: FullName  # what it reads: the chain's output
+    # From one start to the next; None: it sleeps irregularly, and has no period.
+    period_ns: PositiveDuration | None = None
+    # Between its starts, where they are irregular: 5th percentile, median, 95th percentile.
+    intervals_ns: tuple[Duration, Duration, Duration] | None = None
+    # How long after the start of a cycle of the chain its instances start, at the earliest, modulo
+    # the greatest common divisor of its period and the cycle (:attr:`common_ns`).
+    phase_ns: Duration = 0
+    jitter_ns: Duration = 0  # its starts lie within so much behind the phase, 99 % of them
+    # How much faster than the chain's clock the loop's runs, in millionths; its phase moves so.
+    drift_ppm: Annotated[float, Field(allow_inf_nan=False)] = 0.0
+    samples: FromOne  # instances that were measured
+    # From the output's publication to the loop's store: shortest, longest of 99.5 %, longest.
+    delivery_ns: tuple[Duration, Duration, Duration]
+    lead_ns: Duration  # so long before an instance the output leaves, in step: delivery and margin
+    # "output": at each start of the loop the output's slot is put the lead before its instances.
+    # "loop": the loop's sleep is moved once, so that it starts the lead behind the slot's start.
+    in_step: Literal["output", "loop"] | None = None
+    # In step with "output", the earliest start of the slot, behind L̄ + ε; the latest is
+    # `common_ns` later. It may lie behind the cycle: then the output leaves in the next one.
+    earliest_start_ns: Duration | None = None
+    # In step with "loop", how much later than in the recording its instances start.
+    move_ns: Duration | None = None
+    # The real-time priority that the thread has by itself; None: it has none.
+    realtime_priority: FromOne | None = None
+    # Where its thread runs while the plan is in force; None: where and as it does by itself.
+    runs_at: ReceiverPlace | None = None
+    age: LoopAge  # with the phase of the recording, or in step
+    age_at_any_phase: LoopAge | None = None  # whatever phase the loop starts with; None: the same
+
+    @property
+    def stored_ns(self) -> Range:
+        """From the start of the output's slot to the loop's store: shortest, and with margin."""
+        return self.delivery_ns[0], max(self.delivery_ns[0], self.lead_ns)
+
+
 class ShapingNode(Part):
     """The node that takes a topic and republishes it in the slots of the server with its thread."""
 
@@ -358,6 +420,7 @@ class ChainPlan(Part):
     further_shaping_nodes: tuple[ShapingNode, ...] = ()
     modes: Modes | None = None
     adaptation: Adaptation | None = None
+    loop: PlannedLoop | None = None  # that reads the output; None: no loop of the chain does
     predicted: Prediction
 
     def __repr__(self) -> str:
@@ -373,7 +436,7 @@ class ChainPlan(Part):
 
     @model_validator(mode="after")
     def _consistent(self) -> "ChainPlan":
-        rules = (_servers, _overlaps, _shaping_nodes, _modes, _publisher_threads, _choices)
+        rules = (_servers, _overlaps, _shaping_nodes, _modes, _publisher_threads, _choices, _loop)
         return checked(self, _cycle, *rules)
 
 
@@ -628,6 +691,45 @@ def _choices(plan: ChainPlan) -> Wrong:
         if latest is not None and slot[1] > latest:
             reason = f"{duration_text(latest)}, but the slot {slot_text(slot)} ends behind it"
             yield f"{reason}: write more", "adaptation", "max_latency"
+
+
+def loop_common_ns(plan: ChainPlan) -> int:
+    """Return g, the greatest common divisor of the cycle and the period of the plan's loop (ns).
+
+    Instances of the loop lie g apart in the cycle. Raises ValueError: no loop of a period reads the
+    output.
+    """
+    if plan.loop is None or plan.loop.period_ns is None:
+        raise ValueError("the plan has no loop with a period")
+    return math.gcd(plan.cycle_ns, plan.loop.period_ns)
+
+
+def _loop(plan: ChainPlan) -> Wrong:
+    loop = plan.loop
+    if loop is None:
+        return
+    if plan.chain.output not in (None, loop.topic):
+        reason = f"{loop.topic}, but the chain's output is {plan.chain.output}: make them the same"
+        yield reason, "loop", "topic"
+    if (loop.period_ns is None) == (loop.intervals_ns is None):
+        yield "write its period, or the intervals of an irregular one", "loop"
+    if loop.in_step is None:
+        return
+    if loop.period_ns is None:
+        yield "it has no period, so nothing is in step with it: remove this", "loop", "in_step"
+        return
+    if loop.period_ns % plan.cycle_ns and plan.cycle_ns % loop.period_ns:
+        reason = f"neither of its period {duration_text(loop.period_ns)} and the cycle"
+        reason += f" {duration_text(plan.cycle_ns)} is a multiple of the other, so no age is"
+        yield f"{reason} constant: remove this", "loop", "in_step"
+    if plan.shaping_node is None or len(publish_slots(plan)) != 1:
+        reason = "a shaping node has to publish the output in one slot of the cycle, which is put"
+        yield f"{reason} before the loop's start: remove this", "loop", "in_step"
+    if (loop.in_step == "output") != (loop.earliest_start_ns is not None):
+        reason = "goes with in_step: output, and only with it"
+        yield reason, "loop", "earliest_start"
+    if (loop.in_step == "loop") != (loop.move_ns is not None):
+        yield "goes with in_step: loop, and only with it", "loop", "move"
 
 
 def below_executors(servers: Sequence[Server]) -> tuple[Server, ...]:

@@ -38,8 +38,12 @@ ROOMY_SLOT_NS = 10_000_000  # suffices for many sends where the machine stalls f
 def cycles_until_output(plan: ChainPlan, node: ShapingNode | None = None) -> int:
     """Return how many cycles after its own the chain's output is due, or that of a ``node``.
 
-    Under LET per callback each topic is due a cycle after the topic before it.
+    Under LET per callback each topic is due a cycle after the topic before it. In step with a loop
+    the slot may lie in the next cycle, before which the chain is not done (``earliest_start_ns``).
     """
+    if plan.loop is not None and plan.loop.earliest_start_ns is not None:
+        earliest = plan.loop.earliest_start_ns if node in (None, plan.shaping_node) else 0
+        return -(-(earliest - plans.publish_slots(plan)[0][0]) // plan.cycle_ns)
     if plan.policy == "let-per-chain":
         return 1
     if plan.policy == "let-per-callback":

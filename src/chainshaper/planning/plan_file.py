@@ -57,6 +57,8 @@ _SECTION_COMMENTS = {
     "modes": "each mode's band, 1 is the first slot; the topic (std_msgs/String) names the mode",
     "adaptation": "how slots follow the latencies (apply --adapt): later when so many times the"
     " promised share\n# of a window is late, earlier for this gain after so many cycles",
+    "loop": "reads the output, at a phase that is another one at each start of the loop; ages count"
+    " from the\n# start of a cycle, of a message's first use and of all cycles of the loop",
     "predicted": "for the slots as planned; not updated when they are edited",
 }
 
