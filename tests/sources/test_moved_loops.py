@@ -54,7 +54,9 @@ static int64_t now(void) {
   clock_gettime(CLOCK_MONOTONIC, &time);
   return time.tv_sec * 1000000000LL + time.tv_nsec;
 }
-static struct timespec spec(int64_t ns) { return (struct timespec){ns / 1000000000, ns % 1000000000}; }
+static struct timespec spec(int64_t ns) {
+  return (struct timespec){ns / 1000000000, ns % 1000000000};
+}
 static pthread_mutex_t mutex = PTHREAD_MUTEX_INITIALIZER;
 static pthread_cond_t condition = PTHREAD_COND_INITIALIZER;
 static void work(int64_t ns) { for (int64_t until = now() + ns; now() < until;) continue; }
@@ -101,8 +103,10 @@ int main(int count, char **words) {
       while (pthread_cond_clockwait(&condition, &mutex, CLOCK_MONOTONIC, &time) == 0) continue;
       pthread_mutex_unlock(&mutex);
     }
-    if (!strcmp(by, "once")) timerfd_settime(timer, TFD_TIMER_ABSTIME, &(struct itimerspec){{0, 0}, time}, NULL);
-    if (!strcmp(by, "once") || !strcmp(by, "timer")) if (read(timer, &times, 8) != 8) return 1;
+    struct itimerspec single = {{0, 0}, time};
+    if (!strcmp(by, "once")) timerfd_settime(timer, TFD_TIMER_ABSTIME, &single, NULL);
+    if (!strcmp(by, "once") || !strcmp(by, "timer"))
+      if (read(timer, &times, 8) != 8) return 1;
     if (!strcmp(by, "checked")) {  // as ros2_control since 4.20: what is over is left out
       while (next < now()) next += period;
       time = spec(next);
@@ -330,8 +334,8 @@ def test_a_request_that_is_half_written_counts_for_nothing(program: Path, tmp_pa
         mover = loop.mover()
         number = mover.move(4 * MS, PERIOD)
         settled(mover, number)
-        mover._asked["move"] = 9 * MS  # noqa: SLF001 - its writer was killed in the midst of it
-        mover._asked["number"] = number + 1  # noqa: SLF001
+        mover._asked["move"] = 9 * MS  # its writer was killed in the midst of it
+        mover._asked["number"] = number + 1
         seen_until(mover, 20)
         assert not mover.seen()[1]
     assert loop.tables["loop_moved"]["kept"].to_list() == [0, 4 * MS]

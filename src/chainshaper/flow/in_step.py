@@ -15,25 +15,30 @@ Both repeat in time; what they have in common is the greatest common divisor of 
 loop. Moves are of less than a step, and later ones small, as the drift has it.
 """
 
-import math
 import os
 import threading
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Protocol, TypeAlias
+from typing import Protocol
 
 from chainshaper.analysis.loop_phase import LoopPhase, PhaseTrack, phase_of
 from chainshaper.enforcement.undoing import LoopStep
 from chainshaper.linux.threads import list_threads
-from chainshaper.planning.chain_plan import ChainPlan, publish_slots
+from chainshaper.planning.chain_plan import (
+    ChainPlan,
+    PlannedLoop,
+    loop_common_ns,
+    publish_slots,
+)
 from chainshaper.planning.offsets import chain_name
+from chainshaper.planning.overruns import cycles_until_output
+from chainshaper.planning.plan import Plan, reach
 from chainshaper.sources.preload.moving import LoopMoved, LoopMover
 from chainshaper.splicing.shaped_outputs import FollowedOutput
 from chainshaper.values.durations import duration_text
-from chainshaper.values.errors import ChainshaperError, OperationError
+from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 
-Moves: TypeAlias = Literal["output", "loop"]
 TOLERANCE_NS = 30_000  # nothing is moved for less
 LOOK_S = 0.1
 STEPS = 50  # so many of the latest moves are shown
@@ -44,34 +49,14 @@ _SEARCH_EVERY = 10  # looks from one search for the loop to the next
 class LoopStarts(Protocol):
     """A loop's thread that is followed, and perhaps moved: as :class:`.LoopMover`."""
 
+    tid: int
+
     @property
     def is_there(self) -> bool: ...
     def seen(self) -> tuple[list[int], list[LoopMoved]]: ...
     def move(self, move_ns: int, period_ns: int) -> int: ...
     def renew(self) -> None: ...
     def close(self) -> None: ...
-
-
-@dataclass(frozen=True)
-class StepWish:
-    """Which loop is to be in step with a chain's output. Times are ns.
-
-    * ``node``: of the loop.
-    * ``period_ns``: of the loop, as planned.
-    * ``lead_ns``: how long before a start of the loop the output leaves its slot.
-    * ``moves``: what is moved.
-    """
-
-    node: str
-    period_ns: int
-    lead_ns: int
-    moves: Moves
-    tolerance_ns: int = TOLERANCE_NS
-
-
-def step_of(period_ns: int, cycle_ns: int) -> int:
-    """Return the distance at which an output has the same relation to a loop's starts (ns)."""
-    return math.gcd(period_ns, cycle_ns)
 
 
 def next_move(
@@ -125,9 +110,10 @@ class InStep:
     The thread may end by itself, with a ``failure``.
 
     * ``steps``: what was moved, and why, the latest ones.
-    * ``loop``, ``chain``: where they are by now; None: not known yet.
+    * ``loop_moves``: what was added to the loop's sleeps, all that was seen.
+    * ``chain``: one whose plan has a loop in step.
     * ``pids``: processes of which one may be the gate.
-    * ``reach_ns``: how far the output's slots may be moved later.
+    * ``reach_ns``: how far the output's slots may be moved, earlier and later.
     * ``find``: looks for the loop; it returns its starts until now as well, or None.
     * ``put_in_force``: has servers move their slots by so much (ns), and returns from when on the
       gate has to move its own.
@@ -139,32 +125,58 @@ class InStep:
     def __init__(
         self,
         chain: ChainPlan,
-        wish: StepWish,
         pids: Collection[int],
-        reach_ns: int,
+        reach_ns: tuple[int, int],
         find: Callable[[], LoopStarts | None],
         put_in_force: Callable[[int], int],
         *,
         cores: Collection[int] = (),
+        tolerance_ns: int = TOLERANCE_NS,
     ) -> None:
-        assert chain.shaping_node is not None  # noqa: S101 - else there is no slot to move
+        loop, shaping = chain.loop, chain.shaping_node
+        assert loop is not None and loop.period_ns is not None  # noqa: S101 - as planned
+        assert shaping is not None  # noqa: S101 - else there is no slot to move
         self.steps: tuple[LoopStep, ...] = ()
         self.failure: ChainshaperError | None = None
-        self.chain, self.wish = chain, wish
-        self.step_ns = step_of(wish.period_ns, chain.cycle_ns)
-        self._slot_ns = publish_slots(chain)[-1][0]
+        self.loop_moves: list[LoopMoved] = []
+        self.chain, self.loop, self.period_ns = chain, loop, loop.period_ns
+        self.step_ns, self._tolerance_ns = loop_common_ns(chain), tolerance_ns
+        # When the output leaves behind the beginning of its cycle, perhaps in the next one.
+        self._slot_ns = publish_slots(chain)[0][0] + cycles_until_output(chain) * chain.cycle_ns
+        if loop.earliest_start_ns is not None:
+            reach_ns = (max(reach_ns[0], loop.earliest_start_ns - self._slot_ns), reach_ns[1])
         self._reach_ns, self._find, self._put_in_force = reach_ns, find, put_in_force
-        self._output = FollowedOutput(chain.shaping_node.output, pids)
+        self._output = FollowedOutput(shaping.output, pids)
         self._origins = PhaseTrack(chain.cycle_ns, _ORIGINS_NS)
-        self._loop: LoopStarts | None = None
-        self._loops, self._own, self._restarts = PhaseTrack(wish.period_ns), OwnStarts(), 0
+        self.tid = 0  # of the loop's thread, the latest that was found
+        self._mover: LoopStarts | None = None
+        self._loops, self._own, self._restarts = PhaseTrack(self.period_ns), OwnStarts(), 0
         self._moved_ns: int | None = None  # of what is moved; None: it was not, since it started
         self._number = 0  # of the latest request to the loop
-        self._unreachable_ns = wish.period_ns  # from here on a move changes the loop's rate
+        self._unreachable_ns = self.period_ns  # from here on a move changes the loop's rate
         self._looks = 0
         self._cores, self._stop = cores, threading.Event()
         self._thread = threading.Thread(target=self._follow, name="in-step", daemon=True)
         self._thread.start()
+
+    @property
+    def has_loop(self) -> bool:
+        """Whether the loop is there."""
+        return self._mover is not None
+
+    @property
+    def is_in_step(self) -> bool:
+        """Whether both have been brought into step since the loop was found."""
+        return self._mover is not None and self._moved_ns is not None
+
+    @property
+    def waits_for(self) -> str:
+        """What is not known yet, or is out of reach."""
+        if self._loops.phase is None:
+            return "the loop's phase is being measured, or it sleeps irregularly"
+        if self._origins.phase is None:
+            return "where the chain begins is being measured, or it begins irregularly"
+        return "they are about to be"
 
     @property
     def loop_phase(self) -> LoopPhase | None:
@@ -181,8 +193,8 @@ class InStep:
         loop, origin = self._loops.phase, self._origins.phase
         if loop is None or origin is None or self._moved_ns is None:
             return None
-        start = loop.near(origin.at_ns) + (self._moved_ns if self.wish.moves == "loop" else 0)
-        slot = self._slot_ns + (self._moved_ns if self.wish.moves == "output" else 0)
+        start = loop.near(origin.at_ns) + (self._moved_ns if self.loop.in_step == "loop" else 0)
+        slot = self._slot_ns + (self._moved_ns if self.loop.in_step == "output" else 0)
         return slot + (start - origin.at_ns - slot) % self.step_ns
 
     def end(self) -> None:
@@ -190,8 +202,8 @@ class InStep:
         self._stop.set()
         self._thread.join()
         self._output.close()
-        if self._loop is not None:
-            self._loop.close()
+        if self._mover is not None:
+            self._mover.close()
 
     def _follow(self) -> None:
         if self._cores:
@@ -211,34 +223,36 @@ class InStep:
         self._origins.saw(self._output.origins(self.chain.cycle_ns))
         self._look_at_loop()
         loop, origin = self._loops.phase, self._origins.phase
-        if self._loop is None or loop is None or origin is None:
+        if self._mover is None or loop is None or origin is None:
             return
-        if self.wish.moves == "loop":
-            self._move_loop(self._loop, loop, origin)
+        if self.loop.in_step == "loop":
+            self._move_loop(self._mover, loop, origin)
         else:
             self._move_output(loop, origin)
 
     def _look_at_loop(self) -> None:
         """Read what the loop has done; look for it where it has ended."""
-        if self._loop is not None and not self._loop.is_there:
+        if self._mover is not None and not self._mover.is_there:
             self._note(None, "the loop has ended: its phase is measured anew when it runs again")
-            self._loop = None
-        if self._loop is None:
+            self._mover = None
+        if self._mover is None:
             if self._looks % _SEARCH_EVERY != 1:
                 return
-            self._loop = self._find()
-            self._loops, self._own = PhaseTrack(self.wish.period_ns), OwnStarts()
-            self._moved_ns = self._moved_ns if self.wish.moves == "output" else None
+            self._mover = self._find()
+            self._loops, self._own = PhaseTrack(self.period_ns), OwnStarts()
+            self._moved_ns = self._moved_ns if self.loop.in_step == "output" else None
             self._restarts, self._number = 0, 0
-            if self._loop is None:
+            if self._mover is None:
                 return
-        starts, moves = self._loop.seen()
+            self.tid = self._mover.tid
+        starts, moves = self._mover.seen()
+        self.loop_moves += moves
         self._loops.saw(self._own.of(starts, moves))
         if self._loops.restarts > self._restarts:
             self._restarts = self._loops.restarts
             self._note(None, "the loop starts elsewhere now: its phase is measured anew")
-        if self.wish.moves == "loop":
-            self._loop.renew()
+        if self.loop.in_step == "loop":
+            self._mover.renew()
         for move in moves:
             if move.why == "rate changed":
                 self._unreachable_ns = min(self._unreachable_ns, move.asked_ns)
@@ -250,13 +264,13 @@ class InStep:
                 )
 
     def _move_loop(self, mover: LoopStarts, loop: LoopPhase, origin: LoopPhase) -> None:
-        output = origin.at_ns + self._slot_ns + self.wish.lead_ns
+        output = origin.at_ns + self._slot_ns + self.loop.lead_ns
         period_ns = round(loop.period_ns)
         range_ns = (0, min(period_ns, self._unreachable_ns) - 1)
         before = self._moved_ns
         # The loop's place is that of its own starts; a small step follows a drift, a large one not.
         wanted = output - loop.near(output)
-        moved = next_move(before or 0, wanted, self.step_ns, range_ns, self.wish.tolerance_ns)
+        moved = next_move(before or 0, wanted, self.step_ns, range_ns, self._tolerance_ns)
         if moved != before:
             self._number = mover.move(moved, period_ns)
             self._moved_ns = moved
@@ -264,9 +278,8 @@ class InStep:
 
     def _move_output(self, loop: LoopPhase, origin: LoopPhase) -> None:
         before = self._moved_ns
-        wanted = loop.near(origin.at_ns) - self.wish.lead_ns - origin.at_ns - self._slot_ns
-        range_ns = (0, self._reach_ns)
-        moved = next_move(before or 0, wanted, self.step_ns, range_ns, self.wish.tolerance_ns)
+        wanted = loop.near(origin.at_ns) - self.loop.lead_ns - origin.at_ns - self._slot_ns
+        moved = next_move(before or 0, wanted, self.step_ns, self._reach_ns, self._tolerance_ns)
         if moved != before:
             self._output.move(moved, self._put_in_force(moved))
             self._moved_ns = moved
@@ -277,8 +290,8 @@ class InStep:
         step = LoopStep(
             at_ns=time.monotonic_ns(),
             chain=chain_name(self.chain),
-            loop=self.wish.node,
-            moves=self.wish.moves,
+            loop=self.loop.node,
+            moves=self.loop.in_step or "",
             moved_ns=moved_ns,
             drift_ppm=None if loop is None else round(loop.drift_ppm, 1),
             why=why,
@@ -286,9 +299,7 @@ class InStep:
         self.steps = (*self.steps, step)[-STEPS:]
 
 
-def _why(
-    before: int | None, moved: int, loop: LoopPhase, origin: LoopPhase, step_ns: int
-) -> str:
+def _why(before: int | None, moved: int, loop: LoopPhase, origin: LoopPhase, step_ns: int) -> str:
     if before is None:
         spread = duration_text(round(loop.spread_ns, -3))
         return f"its phase was measured in {loop.starts} starts, which spread over {spread}"
@@ -297,17 +308,49 @@ def _why(
     return f"the clocks drift apart by {loop.drift_ppm - origin.drift_ppm:+.1f} ppm"
 
 
-def find_loop(pid: int, period_ns: int, lease_ns: int = 5_000_000_000) -> LoopMover | None:
-    """Return the loop of a process that the library in front sees; None: no thread has the period.
+def find_loop(pid: int, loop: PlannedLoop, lease_ns: int = 5_000_000_000) -> LoopMover | None:
+    """Return a planned loop of a process, as the library in front sees it; None: it has none.
 
-    What it had seen of the loop before is still to be taken with ``seen``.
+    It is the thread of the planned name or, where none is planned, that starts at the period. What
+    was seen of the loop before is still to be taken with ``seen``.
     """
     for thread in list_threads(pid):
+        if loop.thread not in (None, thread.comm):
+            continue
         try:
             mover = LoopMover(pid, thread.tid, lease_ns)
         except OperationError:
             continue
         starts, _ = mover.seen()
-        if phase_of(starts[-200:], period_ns) is not None:
+        if phase_of(starts[-200:], loop.period_ns or 0) is not None:
             return LoopMover(pid, thread.tid, lease_ns)
     return None
+
+
+def loops_in_step(plan: Plan, adapt: bool = False) -> list[tuple[int, ChainPlan, PlannedLoop]]:
+    """Return the chains of a plan that are in step with a loop: place, chain and loop.
+
+    Raises InputError: their slots are to follow latencies as well (``adapt``).
+    """
+    chains = [
+        (place, chain, chain.loop)
+        for place, chain in enumerate(plan.chains)
+        if chain.loop is not None and chain.loop.in_step is not None
+    ]
+    if chains and adapt:
+        raise InputError(
+            f"slots of {chain_name(chains[0][1])} are in step with a loop, so they cannot follow"
+            " latencies: leave out --adapt, or plan without --in-step"
+        )
+    return chains
+
+
+def reach_of(plan: Plan, place: int) -> tuple[int, int]:
+    """Return how far the slots of a chain in step may be moved (ns), earlier and later.
+
+    (0, 0): they stay, also where nothing needs them to move.
+    """
+    loop = plan.chains[place].loop
+    if loop is None or loop.in_step != "output":
+        return 0, 0
+    return reach(plan, place)

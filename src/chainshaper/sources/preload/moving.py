@@ -4,9 +4,9 @@ The request stands in the memory of the loop's process, in the ring of its threa
 it when the thread goes to sleep. Nothing of the application changes, and a thread that no request
 names does nothing for this. What was added to which sleep the event `loop_moved` says.
 
-* A loop that sleeps until instants of its own (ros2_control's, `rclcpp::Rate`) has the move added to
-  each sleep, so it has the less time for its work: with the move, an instance must still end within
-  the loop's period. Where the move makes it leave instances out, the library takes it back
+* A loop that sleeps until instants of its own (ros2_control's, `rclcpp::Rate`) has the move added
+  to each sleep, so it has the less time for its work: with the move, an instance must still end
+  within the loop's period. Where the move makes it leave instances out, the library takes it back
   ("rate changed" in LOOP_MOVES), and nothing is moved until another request.
 * In any other loop one sleep is longer, and all later ones follow.
 

@@ -1,0 +1,82 @@
+"""Loops that are kept in step with outputs while a plan is in force."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+from chainshaper.enforcement.node_threads import Allocation
+from chainshaper.flow.in_step import InStep, LoopStarts, find_loop, loops_in_step, reach_of
+from chainshaper.flow.plan_in_force.followers import Followers
+from chainshaper.flow.plan_in_force.report import RunReport
+from chainshaper.flow.polled_loop import PolledLoop
+from chainshaper.linux.scheduling import available_cores
+from chainshaper.planning.chain_plan import PlannedLoop
+from chainshaper.planning.offsets import chain_name
+
+
+@dataclass
+class LoopsInStep:
+    """The loops of a run that are kept in step, by the places of their chains in the plan."""
+
+    running: dict[int, InStep] = field(default_factory=dict)
+    threads: Allocation = field(default_factory=lambda: Allocation((), ()))  # at the latest look
+
+    def start(self, followers: Followers, allocation: Allocation) -> None:
+        """Begin to keep the plan's loops in step. Raises OperationError: a gate is not there."""
+        plan = followers.anchored.given
+        cores = set(available_cores()) - {server.core for server in followers.anchored.plan.servers}
+        pids = [listed.thread.pid for listed in allocation.threads]
+        self.threads = allocation
+        for place, chain, loop in loops_in_step(plan):
+            self.running[place] = InStep(
+                chain,
+                pids,
+                reach_of(plan, place),
+                partial(self.find, loop),
+                partial(followers.move_slots, place),
+                cores=cores,
+            )
+
+    def find(self, loop: PlannedLoop) -> LoopStarts | None:
+        """Look for a loop among the threads of the latest look.
+
+        Where no library is in front of it, its wake-ups are counted from outside, and it cannot be
+        moved.
+        """
+        of_node = [listed for listed in self.threads.threads if loop.node in listed.nodes]
+        for pid in sorted({listed.thread.pid for listed in of_node}):
+            if (mover := find_loop(pid, loop)) is not None:
+                return mover
+        if loop.in_step == "loop" or loop.thread is None or loop.period_ns is None:
+            return None
+        named = [listed.thread for listed in of_node if listed.thread.comm == loop.thread]
+        return PolledLoop(named[0].pid, named[0].tid, loop.period_ns) if len(named) == 1 else None
+
+    def show(self, report: RunReport, allocation: Allocation) -> None:
+        """Show what was moved; end what has failed, and note why. ``allocation``: as by now."""
+        self.threads = allocation
+        steps = [step for kept in self.running.values() for step in kept.steps]
+        report.show_steps(sorted(steps, key=lambda step: step.at_ns))
+        for place, kept in tuple(self.running.items()):
+            named = f"{chain_name(kept.chain)} and the loop of {kept.loop.node}"
+            if kept.failure is not None:
+                del self.running[place]
+                kept.end()
+                report.note(f"{named} are not in step any more: {kept.failure}")
+            else:
+                report.replace_notes(f"{named} are not in step", *_missing(named, kept))
+
+    def end(self) -> None:
+        """Slots and loops go back to where the plan, and the loops themselves, have them."""
+        for kept in self.running.values():
+            kept.end()
+
+
+def _missing(named: str, kept: InStep) -> Sequence[str]:
+    """Say what is missing for both to be in step, if something is."""
+    if kept.is_in_step:
+        return ()
+    if not kept.has_loop:
+        remedy = "start it beneath the library in front: `chainshaper watch -- COMMAND`"
+        return (f"{named} are not in step: no such loop is seen to sleep; {remedy}",)
+    return (f"{named} are not in step yet: {kept.waits_for}",)
