@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 FEWEST = 16  # starts from which a phase is known
-MOST = 4096  # starts that are remembered
+MOST = 1024  # starts that are remembered
 LONGEST_NS = 20_000_000_000  # of the starts that are remembered, the first is no older
 RESTARTED = 8  # so many starts in turn elsewhere: the loop was started again, or has been moved
 _LARGEST_DRIFT = 1e-3  # of a period: a loop that deviates by more has another one
