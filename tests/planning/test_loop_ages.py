@@ -158,7 +158,9 @@ def test_a_slot_that_straddles_the_read_gives_two_ages() -> None:
 
 def test_slot_and_loop_get_into_step() -> None:
     """The loop begins at 3 ms and every 10 ms; a slot from 12 ms on is to lie 1 ms before it."""
-    assert start_in_step(12 * MS, MS, 3 * MS, 10 * MS) == 12 * MS
-    assert start_in_step(12 * MS + 1, MS, 3 * MS, 10 * MS) == 22 * MS
+    assert start_in_step((12 * MS, 30 * MS), MS, 3 * MS, 10 * MS) == 12 * MS
+    assert start_in_step((12 * MS + 1, 30 * MS), MS, 3 * MS, 10 * MS) == 22 * MS
+    # The cycle of 20 ms ends before: the message waits for the instance of 23 ms.
+    assert start_in_step((12 * MS + 1, 19 * MS), MS, 3 * MS, 10 * MS) == 19 * MS
     assert move_into_step(15 * MS, MS, 3 * MS, 10 * MS) == 3 * MS
     assert move_into_step(15 * MS, MS, 6 * MS, 10 * MS) == 0

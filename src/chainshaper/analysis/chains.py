@@ -145,6 +145,12 @@ def _chain(graph: ApplicationGraph, spec: str | None, path: GraphPath) -> Chain:
     return chain if spec is not None else replace(chain, spec="..".join(_way_points(graph, chain)))
 
 
+def chain_until(graph: ApplicationGraph, chain: Chain, hops: int) -> Chain:
+    """Return the first part of a chain: so many callbacks, with their topics as way points."""
+    part = Chain("", chain.callbacks[:hops], chain.topics[:hops])
+    return replace(part, spec="..".join(_way_points(graph, part)))
+
+
 def _way_points(graph: ApplicationGraph, chain: Chain) -> Iterator[str]:
     """Yield the topics of a chain, and nodes that share their name with another running node."""
     for callback, topic in zip(graph.path(chain), chain.topics, strict=True):

@@ -12,6 +12,7 @@ wins is an inference, unless the loop evidently queues its messages.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import polars as pl
 
@@ -57,14 +58,32 @@ def data_age(
 
     ``between``: two instants (ns; the second may be None) between which its cycles began.
     """
-    chain = traversals.chain
+    reading = last_loop(graph, traversals.chain)
+    if reading is None:
+        return None
+    return _ages_at(flow, traversals, graph, reading.hop, loop=reading.loop, between=between)
+
+
+class LoopReading(NamedTuple):
+    """A loop that a chain goes through.
+
+    ``hop`` is the place of the chain's callback that stores for it what the topic before brings;
+    on the topic of that place the loop publishes.
+    """
+
+    hop: int
+    loop: Callback
+
+
+def last_loop(graph: ApplicationGraph, chain: Chain) -> LoopReading | None:
+    """Return the last loop that a chain goes through; None: it goes through none."""
     path = graph.path(chain)
     for hop in reversed(range(len(path))):
         topic = chain.topics[hop]
         reading = readers(graph, path[hop], topic) if topic in path[hop].passes_on else []
         loops = [reader for reader in reading if reader.kind == "loop"]
         if loops and len(reading) == 1:
-            return _ages_at(flow, traversals, graph, hop, loop=loops[0], between=between)
+            return LoopReading(hop, loops[0])
     return None
 
 

@@ -261,14 +261,15 @@ def _in_order(process: RunningProcess, earlier: RecordedProcess) -> dict[int, Re
     """Match the threads of a process with those of an earlier run; none if that is not sure.
 
     A program starts its threads in the same order every time. So among threads of the same name,
-    the first now is the first then, and so on, if there are as many. Threads are matched only if
-    executors ran on others than the main thread.
+    the first now is the first then, and so on, if there are as many. Executors are matched only if
+    they ran on others than the main thread. Threads of loops always are.
     """
     executing = [thread for thread in earlier.threads if thread.role == "executor"]
+    looping = [thread for thread in earlier.threads if thread.role == "loop"]
     matched: dict[int, RecordedThread] = {}
     if all(thread.tid == earlier.pid for thread in executing):
-        return matched
-    for name in {thread.comm for thread in executing}:
+        executing = []
+    for name in {thread.comm for thread in (*executing, *looping)}:
         before = [thread for thread in earlier.threads if thread.comm == name]
         now = [thread.inner_tid for thread in process.threads if thread.comm == name]
         if len(before) != len(now):

@@ -8,8 +8,11 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from chainshaper.analysis import LatencyAnalysis, analyse_latency, recorded_flow
+from chainshaper.analysis.chains import find_chain
 from chainshaper.analysis.contradictions import refuse_contradicted
+from chainshaper.analysis.graph import graph_of
 from chainshaper.flow.recorded_profile.chain_profile import profile_of
+from chainshaper.flow.recorded_profile.loops import before_loop, recorded_loop
 from chainshaper.flow.recorded_profile.modes import modes_in_force
 from chainshaper.flow.recorded_profile.stages import Stage, graph_stages
 from chainshaper.planning import Modes, Plan, PlanRequest, Profile, plan_chain
@@ -47,6 +50,9 @@ def profile_chains(
     in it, by the description of what ran. What happened before ``since_ns`` or from ``until_ns`` on
     is left out.
 
+    Of a chain that goes through a loop, what comes before the last one is profiled, with what was
+    measured of that loop.
+
     Raises InputError: no such chain or mode, or a chain's period is not known, or known and given
     as well. OperationError: fewer than two complete traversals of a chain, or in a mode.
     """
@@ -57,7 +63,14 @@ def profile_chains(
         until = None if until_ns is None else begun + until_ns
         recording = replace(recording, events=events.happened(all_events, begun + since_ns, until))
     flow = recorded_flow(recording)
-    analyses = [analyse_latency(flow, chain_of(recording, chain, flow)) for chain in chains]
+    graph = graph_of(flow)
+    named = [find_chain(graph, chain_of(recording, chain, flow)) for chain in chains]
+    before = [before_loop(flow, chain) for chain in named]
+    analyses = [analyse_latency(flow, of_chain.chain) for of_chain in before]
+    whole = [
+        None if reading is None else analyse_latency(flow, chain)
+        for chain, (_, reading) in zip(named, before, strict=True)
+    ]
     stages = [graph_stages(analysis.graph, analysis.chain) for analysis in analyses]
     planned = {number for of_chain in stages for stage in of_chain for number in stage.members}
     chained = {number for analysis in analyses for number in analysis.chain.callbacks}
@@ -75,6 +88,11 @@ def profile_chains(
         )
 
     profiles = [profiled(*measured) for measured in zip(analyses, stages, strict=True)]
+    for place, (through, (_, reading)) in enumerate(zip(whole, before, strict=True)):
+        if through is not None and reading is not None:
+            period = profiles[place].period_ns
+            loop = recorded_loop(recording, flow, through, reading, period)
+            profiles[place] = replace(profiles[place], loop=loop)
     if modes is None:
         return tuple(profiles)
     if unknown := ", ".join(mode_recordings.keys() - modes.bands.keys()):

@@ -6,7 +6,7 @@ Creation events say which nodes a process has, the callbacks that ran which thre
 import platform
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -16,6 +16,7 @@ from chainshaper.planning.plan import Plan
 from chainshaper.values.errors import ChainshaperError, shown
 
 if TYPE_CHECKING:
+    from chainshaper.analysis import DataFlow
     from chainshaper.values.recording import Recording  # slow to import
 
 
@@ -90,7 +91,11 @@ def recorded_processes(
         of_node, role = (listed.node,) if listed.node else (), cast(ThreadRole, listed.role)
         threads[listed.pid][listed.tid] = RecordedThread(listed.tid, role, of_node, listed.comm)
         nodes.setdefault(listed.pid, list(of_node))
-    ran = executors(data_flow(tables, info.clock_offset_ns))
+    flow = data_flow(tables, info.clock_offset_ns)
+    for pid, tid, node in _threads_of_loops(flow):
+        comm = threads[pid][tid].comm if tid in threads[pid] else ""
+        threads[pid][tid] = RecordedThread(tid, "loop", (node,), comm)
+    ran = executors(flow)
     executors_in = Counter(executor.pid for executor in ran)
     for executor in ran:
         of_process = threads[executor.pid]
@@ -108,3 +113,12 @@ def recorded_processes(
         if pid in last_seen
     )
     return processes, ()
+
+
+def _threads_of_loops(flow: "DataFlow") -> Iterator[tuple[int, int, str]]:
+    """Yield each thread that is in a loop: process, thread and the loop's node."""
+    import polars as pl
+
+    loops = flow.objects.callbacks.filter(pl.col("kind") == "loop").select("callback_id", "node")
+    ran = flow.instances.join(loops.unique("callback_id"), on="callback_id", maintain_order="left")
+    yield from ran.select("pid", "tid", "node").drop_nulls().unique(maintain_order=True).iter_rows()

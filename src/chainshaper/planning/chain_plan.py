@@ -34,6 +34,7 @@ from chainshaper.values.notebook import notebook_html
 from chainshaper.values.plan_choices import (
     EqualPriorities,
     Fallback,
+    InStep,
     Policy,
     ShapingThread,
     SlotEnds,
@@ -263,6 +264,7 @@ class PlannedLoop(Part):
     output's slot.
     """
 
+    chain: str | None = None  # the chain as the user wrote it, into the loop or through it
     node: FullName  # whose loop it is
     thread: Annotated[str, Field(min_length=1)] | None = None  # its thread's name; None: not known
     topic: FullName  # what it reads: the chain's output
@@ -279,13 +281,16 @@ class PlannedLoop(Part):
     samples: FromOne  # instances that were measured
     # From the output's publication to the loop's store: shortest, longest of 99.5 %, longest.
     delivery_ns: tuple[Duration, Duration, Duration]
-    lead_ns: Duration  # so long before an instance the output leaves, in step: delivery and margin
+    # So long before an instance the output leaves, in step, at least: delivery and margin.
+    lead_ns: Duration
     # "output": at each start of the loop the output's slot is put the lead before its instances.
     # "loop": the loop's sleep is moved once, so that it starts the lead behind the slot's start.
-    in_step: Literal["output", "loop"] | None = None
-    # In step with "output", the earliest start of the slot, behind L̄ + ε; the latest is
-    # `common_ns` later. It may lie behind the cycle: then the output leaves in the next one.
-    earliest_start_ns: Duration | None = None
+    in_step: InStep | None = None
+    # In step with "output", where the slot starts, earliest (behind L̄ + ε) and latest (so that it
+    # ends, and its gate is done, with the cycle): see :func:`.loop_ages.start_in_step`.
+    starts_ns: Range | None = None
+    # How much later the output's slots are so that no instance starts while a message is stored.
+    moved_ns: Duration = 0
     # In step with "loop", how much later than in the recording its instances start.
     move_ns: Duration | None = None
     # The real-time priority that the thread has by itself; None: it has none.
@@ -297,8 +302,11 @@ class PlannedLoop(Part):
 
     @property
     def stored_ns(self) -> Range:
-        """From the start of the output's slot to the loop's store: shortest, and with margin."""
-        return self.delivery_ns[0], max(self.delivery_ns[0], self.lead_ns)
+        """From the start of the output's slot to the loop's store: shortest, and with margin.
+
+        In step, what is stored within the lead is there when the loop's instance starts.
+        """
+        return self.delivery_ns[0], max(self.delivery_ns[0], self.lead_ns - 1)
 
 
 class ShapingNode(Part):
@@ -445,6 +453,21 @@ def in_one_slot(slot: Slot, mean_ns: int | None = None) -> Prediction:
     start, end = slot
     mean_ns = end if mean_ns is None else mean_ns
     return Prediction(mean_ns=mean_ns, max_ns=end, jitter_ns=end - start, shares=(1.0,))
+
+
+def predicted_later(predicted: Prediction, later_ns: int) -> Prediction:
+    """Return the prediction for outputs that leave so much later."""
+    modes = {
+        mode: predicted_later(of_mode, later_ns)
+        for mode, of_mode in (predicted.modes or {}).items()
+    }
+    return predicted.model_copy(
+        update={
+            "mean_ns": predicted.mean_ns + later_ns,
+            "max_ns": predicted.max_ns + later_ns,
+            "modes": modes or None,
+        }
+    )
 
 
 def server_of(plan: ChainPlan, thread: Thread) -> Server | None:
@@ -725,9 +748,8 @@ def _loop(plan: ChainPlan) -> Wrong:
     if plan.shaping_node is None or len(publish_slots(plan)) != 1:
         reason = "a shaping node has to publish the output in one slot of the cycle, which is put"
         yield f"{reason} before the loop's start: remove this", "loop", "in_step"
-    if (loop.in_step == "output") != (loop.earliest_start_ns is not None):
-        reason = "goes with in_step: output, and only with it"
-        yield reason, "loop", "earliest_start"
+    if (loop.in_step == "output") != (loop.starts_ns is not None):
+        yield "goes with in_step: output, and only with it", "loop", "starts"
     if (loop.in_step == "loop") != (loop.move_ns is not None):
         yield "goes with in_step: loop, and only with it", "loop", "move"
 

@@ -94,14 +94,17 @@ def later_without_straddling(times: LoopTimes) -> int | None:
     return first + times.jitter_ns - earliest if first <= latest else 0
 
 
-def start_in_step(earliest_ns: int, lead_ns: int, phase_ns: int, common_ns: int) -> int:
-    """Return the first start of a slot, from ``earliest_ns`` on, so long before a loop's instance.
+def start_in_step(starts_ns: tuple[int, int], lead_ns: int, phase_ns: int, common_ns: int) -> int:
+    """Return the start of a slot that lies so long before a loop's instance; times in ns.
 
-    ``lead_ns`` is how long before; all times are ns from the beginning of the chain's cycle.
-    ``common_ns`` is the greatest common divisor of its cycle and the loop's period: with a multiple
-    of it between them, instances begin at ``phase_ns``.
+    ``starts_ns``: where it starts, earliest and latest, behind the beginning of the chain's cycle.
+    ``lead_ns``: how long before the instance, at least; more, where the latest start is before it.
+    The loop uses the message then in the same instance. ``common_ns`` is the greatest common
+    divisor of the chain's cycle and the loop's period: so far apart its instances begin in a cycle,
+    the first of them at ``phase_ns``.
     """
-    return earliest_ns + (phase_ns - lead_ns - earliest_ns) % common_ns
+    earliest, latest = starts_ns
+    return min(earliest + (phase_ns - lead_ns - earliest) % common_ns, latest)
 
 
 def move_into_step(start_ns: int, lead_ns: int, phase_ns: int, common_ns: int) -> int:

@@ -38,12 +38,8 @@ ROOMY_SLOT_NS = 10_000_000  # suffices for many sends where the machine stalls f
 def cycles_until_output(plan: ChainPlan, node: ShapingNode | None = None) -> int:
     """Return how many cycles after its own the chain's output is due, or that of a ``node``.
 
-    Under LET per callback each topic is due a cycle after the topic before it. In step with a loop
-    the slot may lie in the next cycle, before which the chain is not done (``earliest_start_ns``).
+    Under LET per callback each topic is due a cycle after the topic before it.
     """
-    if plan.loop is not None and plan.loop.earliest_start_ns is not None:
-        earliest = plan.loop.earliest_start_ns if node in (None, plan.shaping_node) else 0
-        return -(-(earliest - plans.publish_slots(plan)[0][0]) // plan.cycle_ns)
     if plan.policy == "let-per-chain":
         return 1
     if plan.policy == "let-per-callback":
@@ -385,6 +381,7 @@ def plan_warnings(*chains: ChainPlan) -> list[str]:
             *_about_late_outputs(plan),
             *_about_evidence(plan),
             *_about_receivers(plan),
+            *_about_loop(plan),
             *publication_warnings(plan),
         )
         name = f"{plan.chain.spec or plan.chain.output}: " if len(chains) > 1 else ""
@@ -491,6 +488,54 @@ def _about_receivers(plan: ChainPlan) -> Iterator[str]:
         text = f"who receives {plan.chain.output} has no place in the plan, since the publisher's"
         text += " own thread is gated: callbacks of receivers start when their core is free, which"
         yield f"{text} is not promised. With --publication synchronous they have a place."
+
+
+def _about_loop(plan: ChainPlan) -> Iterator[str]:
+    """Say what the loop that reads the output makes of its age, what that costs, and what helps."""
+    loop = plan.loop
+    if loop is None:
+        return
+    named = f"the loop of {loop.node}"
+    if loop.period_ns is None:
+        low, usual, high = map(duration_text, loop.intervals_ns or (0, 0, 0))
+        text = f"{named} sleeps irregularly: {usual} lie between its starts, from {low} (p5) to"
+        yield f"{text} {high} (p95). Nothing is planned in step with it."
+        return
+    cycle, period = plan.cycle_ns, loop.period_ns
+    common = plans.loop_common_ns(plan)
+    can_be_constant = common == min(cycle, period)
+    if loop.moved_ns:
+        text = f"{named} starts while messages are stored that leave at"
+        text += f" {milliseconds(_leaves_at(plan) - loop.moved_ns)} ms, and chance would decide"
+        text += f" which it uses: their slot is {milliseconds(loop.moved_ns)} ms later, at"
+        yield f"{text} {milliseconds(_leaves_at(plan))} ms."
+    if loop.drift_ppm:
+        text = f"the clocks of the chain and of {named} drift apart by"
+        text += f" {milliseconds(abs(loop.drift_ppm) * 3_600_000, 1)} ms in an hour, and its phase"
+        helps = "" if loop.in_step == "output" else ": --in-step follows it"
+        yield f"{text} changes by that{helps if can_be_constant else ''}."
+    if not can_be_constant:
+        text = f"neither of the period {duration_text(period)} of {named} and the cycle"
+        text += f" {duration_text(cycle)} is a multiple of the other: wherever the slot is, ages at"
+        text += f" the first use are {duration_text(common)} apart, over"
+        yield f"{text} {duration_text(min(cycle, period) - common)}."
+    elif loop.in_step is None and plan.policy not in plans.UNSHAPED:
+        ages = tuple(map(milliseconds, (loop.age_at_any_phase or loop.age).first_ns))
+        text = f"the phase of {named} is another one at each start of it: the age at the first use"
+        text += (
+            f" lies between {milliseconds(low)} and {milliseconds(high)} ms then. --in-step puts"
+        )
+        yield f"{text} the slot before its instances at each start, --move-loop moves the loop."
+    elif loop.in_step == "loop":
+        text = f"{named} has to start {milliseconds(loop.move_ns or 0)} ms later than it was"
+        yield f"{text} recorded; how much it is, is measured at each start."
+    is_placed = plan.policy == "shaped" and len(plans.publish_slots(plan)) > 1
+    if can_be_constant and not (is_placed or loop.age.constant or loop.drift_ppm):
+        text = f"{named} may start while a message is stored, and chance decides whether it uses it"
+        yield f"{text}: ages at the first use differ by up to a period of the loop."
+    if plan.shaping_node is not None and not (loop.runs_at or loop.realtime_priority):
+        text = f"the thread of {named} has no real-time priority, and the plan no place for it"
+        yield f"{text} beside receivers: it may wait for the chain, and start late."
 
 
 def modes_with_one_slot(plan: ChainPlan) -> Iterator[tuple[tuple[str, ...], Slot]]:

@@ -161,6 +161,18 @@ class Plan(Part):
         return places
 
     @property
+    def loops_at(self) -> dict[str, ReceiverPlace]:
+        """Where the threads of loops run that read outputs, by their nodes; the first counts.
+
+        Loops that are not here run where, and as, they do by themselves.
+        """
+        places: dict[str, ReceiverPlace] = {}
+        for loop in (chain.loop for chain in self.chains):
+            if loop is not None and loop.runs_at is not None:
+                places.setdefault(loop.node, loop.runs_at)
+        return places
+
+    @property
     def takes_turns(self) -> bool:
         """Whether threads of all servers of one priority take turns."""
         return any(chain.equal_priorities == "round-robin" for chain in self.chains)

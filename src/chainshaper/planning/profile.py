@@ -73,6 +73,46 @@ class Reception(NamedTuple):
 
 
 @dataclass(frozen=True)
+class RecordedLoop:
+    """A loop that a chain ends in, or goes through, as it was measured. Times in nanoseconds.
+
+    For its fields see :class:`~.chain_plan.PlannedLoop`; further:
+
+    * ``chain``: as the user wrote it, through the loop.
+    * ``stored_ns``: from the publication of what the loop reads until the callback that stores it
+      begins, and until it ends: the shortest of the first, and of the second the longest of 99.5 %
+      and of all.
+    * ``storing_ns``: how long that callback takes, all but 0.5 % of its instances.
+    * ``takes_itself``: whether the loop's thread takes the messages, so that no event says when
+      they could have been taken.
+    * ``core``: where its thread has to run; None: several, or not known.
+    * ``time_ns``, ``once_ns``: how long its instances take in a cycle of the chain, and how long
+      one takes, at most.
+    * ``before_ns``: so much sooner, in step, the output has to leave, since outputs of other chains
+      leave then for the same loop.
+    """
+
+    chain: str
+    node: str
+    topic: str
+    samples: int
+    stored_ns: tuple[int, int, int]
+    storing_ns: int = 0
+    thread: str | None = None
+    period_ns: int | None = None
+    intervals_ns: tuple[int, int, int] | None = None
+    phase_ns: int = 0
+    jitter_ns: int = 0
+    drift_ppm: float = 0.0
+    takes_itself: bool = False
+    core: int | None = None
+    realtime_priority: int | None = None
+    time_ns: int = 0
+    once_ns: int = 0
+    before_ns: int = 0
+
+
+@dataclass(frozen=True)
 class Profile:
     """What was measured of one chain, under a high SCHED_FIFO priority. Times in nanoseconds.
 
@@ -109,6 +149,8 @@ class Profile:
     receivers: tuple[str, ...] = ()  # nodes that subscribe to the output
     # How the output is received. None: nothing in the recording says it.
     reception: Reception | None = None
+    # The loop that reads the output. None: the chain goes through none.
+    loop: RecordedLoop | None = None
     # The callbacks of the chain and of the branches that it waits for, with their servers' times
     # (:func:`~chainshaper.planning.shaping.server_per_callback`).
     callbacks: tuple[CallbackTimes, ...] = ()

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.planning import chain_plan as plans
-from chainshaper.planning import margins, shaping
+from chainshaper.planning import loops, margins, shaping
 from chainshaper.planning.bands import (
     BandChoice,
     choose_bands,
@@ -118,6 +118,7 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
     refuse_simulated((profile, *sinks), request)
     if not keeps_places(request):
         profile = without_reception(profile)
+    profile = loops.beside_receivers(profile)
     profile, *sinks = _prepared((profile, *map(without_reception, sinks)), request)
     modes = request.modes
     if modes is not None and profile.of_modes and request.policy == "shaped":
@@ -150,7 +151,9 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
     plan = shaping.with_executors(plan, [output.executors for output in (profile, *sinks)])
     plan = plans.revised(plan, modes=modes, slot_ends=request.slot_ends)
     plan = shaping.with_turns(plan, request.equal_priorities)
+    plan = loops.with_loop(plan, profile, request)
     (plan,) = with_receivers_placed([plan], [profile])
+    plan = loops.with_thread_placed(plan, profile)
     return shaping.with_best_effort([plan], best_effort_cores([profile], request))[0]
 
 
@@ -164,7 +167,7 @@ def _fitting_into_cycle(profile: Profile, request: PlanRequest, margin: Margin) 
         reason = f"LET per chain has to be done in the period {duration_text(period)}, and the"
         reason += f" longest latency is {duration_text(longest)}"
         raise OperationError(f"{reason}: plan LET per callback, or a longer period")
-    length = _slot_ns(profile, request)
+    length = slot_ns(profile, request)
     most = period - margin.epsilon_ns - length
     if most < 1:
         reason = f"the margin {duration_text(margin.epsilon_ns)} and the publish slot"
@@ -379,11 +382,11 @@ def _next_cycle(profile: Profile, request: PlanRequest) -> NextCycle | None:
         work_ns = GATE_TAKES_NS + (profile.longest_publication_ns or 0)
         if reception is not None and request.with_receivers:
             work_ns += reception.time_ns + reception.beside_ns
-    slot_ns = _slot_ns(profile, request)
-    return NextCycle(profile.period_ns, slot_ns, work_ns, request.overrun or "publish")
+    length = slot_ns(profile, request)
+    return NextCycle(profile.period_ns, length, work_ns, request.overrun or "publish")
 
 
-def _slot_ns(profile: Profile, request: PlanRequest) -> int:
+def slot_ns(profile: Profile, request: PlanRequest) -> int:
     """Return Δ, the length of the publish slot, long enough for a publication (eq. 2 and 4).
 
     Unless it is given, it is the longest publication measured, 1 ms at least. An asynchronous
@@ -462,7 +465,7 @@ def _placed_modes(profile: Profile, request: PlanRequest, modes: Modes) -> _Plac
         mode: of_mode.longest_ns + margin_of[mode].epsilon_ns for mode, of_mode in profiles.items()
     }
     given = None if request.bands_of_modes == "found" else modes.bands
-    bands, slots = place_modes(starts, _slot_ns(profile, request), given)
+    bands, slots = place_modes(starts, slot_ns(profile, request), given)
     why = f"but each mode's slot is placed from its own latencies, here {len(slots)}: leave it out"
     _refuse_placement(replace(request, bands=1) if request.bands == len(slots) else request, why)
     together = replace(
@@ -516,7 +519,7 @@ def _shaped(
         raise InputError(f"{reason} --publication synchronous, and splice with --node cpp")
     unused = "publication" if request.publication == "asynchronous" else "send"
     del values[f"longest_{unused}_ns"]  # nothing is published in that way
-    length = _slot_ns(profile, request)
+    length = slot_ns(profile, request)
     if request.publish_slot_ns is not None:
         values["publish_slot"] = "given"
     else:

@@ -14,11 +14,12 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from chainshaper.planning import loops
 from chainshaper.planning.chain_plan import (
     PER_CALLBACK,
     ChainPlan,
-    Prediction,
     Server,
+    predicted_later,
     publishing_servers,
     revised,
     running_servers,
@@ -41,6 +42,7 @@ from chainshaper.planning.request import (
     plan_chain,
     refuse_entangled,
     refuse_simulated,
+    slot_ns,
 )
 from chainshaper.planning.shaping import behind_others, with_best_effort
 from chainshaper.values.durations import duration_text, format_duration
@@ -162,10 +164,15 @@ def _planned(
 ) -> tuple[Plan, list[str]]:
     """Return the plan of chains on the cores of their profiles, and remarks about it."""
     alone, groups = replace(request, best_effort=()), beginning_together(profiles)
+    slots_ns = [slot_ns(profile, request) for profile in profiles]
+    profiles = loops.one_before_another(profiles, request, slots_ns)
 
     def plans_of_chains(shifting: bool = False, *, at_once: bool) -> list[ChainPlan]:
         delayed = with_interference(profiles, groups, request, at_once=at_once, shifting=shifting)
-        plans = [_beside_others(profile, delayed, alone) for profile in delayed]
+        plans = [
+            _beside_others(profile, delayed, _for_loops(profile, delayed, alone))
+            for profile in delayed
+        ]
         for group in groups:
             sharing = _sharing_servers([plans[place] for place in group])
             for place, chain_plan in zip(group, sharing, strict=True):
@@ -182,7 +189,20 @@ def _planned(
         for chain_plan, profile in zip(placed, profiles, strict=True)
     ]
     placed = tuple(with_receivers_placed(placed, with_places))
+    placed = tuple(
+        loops.with_thread_placed(
+            chain_plan if len(groups) == 1 else loops.at_other_offsets(chain_plan), profile, placed
+        )
+        for chain_plan, profile in zip(placed, with_places, strict=True)
+    )
     return Plan.of(*with_best_effort(placed, best_effort_cores(profiles, request))), remarks
+
+
+def _for_loops(profile: Profile, every: Sequence[Profile], request: PlanRequest) -> PlanRequest:
+    """Return the wishes for a chain: those about loops are for chains that go through some."""
+    if profile.loop is not None or not any(beside.loop for beside in every):
+        return request
+    return replace(request, in_step=False, move_loop=False)
 
 
 def _beside_others(profile: Profile, every: Sequence[Profile], request: PlanRequest) -> ChainPlan:
@@ -239,22 +259,16 @@ def _sharing_servers(plans: list[ChainPlan]) -> list[ChainPlan]:
             for server in gates
         }
         moved = with_slots(gates, slots_of)
+        if by_ns and plan.loop is not None and plan.loop.in_step is not None:
+            reason = f"the output of {chain_name(plan)} is in step with the loop of"
+            reason += f" {plan.loop.node}, in a slot that those of other chains meet on its core"
+            remedy = "plan the chain alone, give it another core, or leave out --in-step"
+            raise OperationError(f"{reason}: {remedy}")
         taken += moved
-        predicted = _later(plan.predicted, by_ns)
-        changed.append(revised(plan, servers=(*shared.values(), *moved), predicted=predicted))
+        predicted = predicted_later(plan.predicted, by_ns)
+        sharing = revised(plan, servers=(*shared.values(), *moved), predicted=predicted)
+        changed.append(loops.stated(sharing))
     return changed
-
-
-def _later(predicted: Prediction, later_ns: int) -> Prediction:
-    """Return the prediction for outputs that leave so much later."""
-    modes = {mode: _later(of_mode, later_ns) for mode, of_mode in (predicted.modes or {}).items()}
-    return predicted.model_copy(
-        update={
-            "mean_ns": predicted.mean_ns + later_ns,
-            "max_ns": predicted.max_ns + later_ns,
-            "modes": modes or None,
-        }
-    )
 
 
 def _fitting(

@@ -452,7 +452,34 @@ def plan_table(plan: ChainPlan) -> ResultTable:
     table.caption = f"cycle {milliseconds(plan.cycle_ns)}{offset}; {expected_jitter_text(plan)}"
     if (received := receivers_text(plan)) is not None:
         table.caption += f"\n{received}"
+    if (read := loop_text(plan)) is not None:
+        table.caption += f"\n{read}"
     return table
+
+
+def loop_text(plan: ChainPlan) -> str | None:
+    """Text: how old the data of the loop are that reads a plan's output, when it reads them."""
+    loop = plan.loop
+    if loop is None:
+        return None
+    how_often = "irregular" if loop.period_ns is None else f"every {duration_text(loop.period_ns)}"
+    text = f"loop of {loop.node}, {how_often}, reads {loop.topic}: age at the first use"
+    low, high = loop.age.first_ns
+    text += f" {milliseconds(low)} to {milliseconds(high)}"
+    text += ", constant" if loop.age.constant else ""
+    if loop.age.every_ns != loop.age.first_ns:
+        text += f"; in all of its cycles up to {milliseconds(loop.age.every_ns[1])}"
+    fewest, most = loop.age.uses
+    times = f"{fewest} to {most} times" if fewest != most else f"{most} times"
+    times = {(1, 1): "once", (0, 1): "once or never"}.get(loop.age.uses, times)
+    text += f"; a message is used {times}"
+    if loop.in_step == "output":
+        text += (
+            f"\nin step: the slot starts {milliseconds(loop.lead_ns)} before the loop, or sooner"
+        )
+    if loop.in_step == "loop":
+        text += f"\nin step: the loop starts {milliseconds(loop.lead_ns)} behind the slot's start"
+    return text
 
 
 def receivers_text(plan: ChainPlan) -> str | None:

@@ -219,13 +219,16 @@ def _servers(plan: Plan, threads: Sequence[ThreadInfo]) -> dict[int, Server]:
 def _receivers(
     plan: Plan, threads: Sequence[ThreadInfo], servers: Mapping[int, Server]
 ) -> dict[int, ReceiverPlace]:
-    """Core and priority of the threads that receive an output outside servers, by place."""
-    place_of = plan.receivers_at
+    """Core and priority of the threads that receive an output outside servers, by place.
+
+    So does a loop's thread that reads an output.
+    """
+    places = {"executor": plan.receivers_at, "loop": plan.loops_at}
     return {
         number: place
         for number, info in enumerate(threads)
-        if number not in servers and info.role == "executor"
-        if (place := place_of.get(info.node or "")) is not None
+        if number not in servers and info.role in places
+        if (place := places[info.role].get(info.node or "")) is not None
     }
 
 

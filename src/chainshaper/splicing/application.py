@@ -126,7 +126,8 @@ def nothing_to_splice(plan: ChainPlan) -> InputError:
 def _placed(application: Application, plan: Plan) -> Application:
     """Return the application with its nodes on the cores and priorities of their servers.
 
-    Nodes that receive an output get the place that the plan has for them, below the shaping nodes.
+    Nodes that receive an output get the place that the plan has for them, below the shaping nodes,
+    and so do the threads of loops that read it. A loop that is to be moved starts later.
     """
     publishing = {server.name for chain in plan.chains for server in publishing_servers(chain)}
     running = [server for server in plan.servers if server.name not in publishing]
@@ -144,7 +145,24 @@ def _placed(application: Application, plan: Plan) -> Application:
             gates = (shaping.fifo_priority for shaping in plan.shaping_nodes)
             receiving = {"core": place.core, "priority": max(1, min(gates) - 1)}
             nodes[name] = node.model_copy(update=receiving)
+        if (place := plan.loops_at.get(node_name(name))) is not None:
+            gates = (shaping.fifo_priority for shaping in plan.shaping_nodes)
+            raised = {"core": place.core, "priority": max(1, min(gates) - 1)}
+            nodes[name] = _with_loop(nodes[name], raised)
+    moved_ns = {chain.loop.node: chain.loop.move_ns for chain in plan.chains if chain.loop}
+    for name, node in application.nodes.items():
+        if node.loop is not None and (by_ns := moved_ns.get(node_name(name))):
+            nodes[name] = _with_loop(nodes[name], {"phase_ns": node.loop.phase_ns + by_ns})
     return application.model_copy(update={"nodes": nodes})
+
+
+def _with_loop(node: NodeDescription, changes: dict[str, int]) -> NodeDescription:
+    """Return a node with changes of its loop."""
+    callbacks = (
+        callback if callback.loop_ns is None else callback.model_copy(update=changes)
+        for callback in node.callbacks
+    )
+    return node.model_copy(update={"callbacks": tuple(callbacks)})
 
 
 def _spliced(application: Application, plan: ChainPlan, shaping: ShapingNode) -> Application:

@@ -41,6 +41,8 @@ SlotEnds: TypeAlias = Literal["open-until-done", "closed"]
 NodeLanguage: TypeAlias = Literal["python", "cpp"]
 NodeChoice: TypeAlias = Literal["auto", "python", "cpp"]
 """The shaping node that a user chooses; :mod:`.splicing.node_kinds` finds out the rest."""
+InStep: TypeAlias = Literal["output", "loop"]
+"""What is put in step with a loop that reads the output: the output's slot, or the loop itself."""
 Solver: TypeAlias = Literal["exact", "pso", "random"]
 """What places latency bands; the paper uses particle swarm optimisation (section 3.3)."""
 Goal: TypeAlias = Literal["mean", "jitter", "gap"]
@@ -59,6 +61,7 @@ class Option(NamedTuple):
 
 BANDS, MARGIN = "Latency bands", "Margin"  # panels of the help
 SLOTS, GATE = "Slots and servers", "The gate of the output"
+LOOP = "A loop that reads the output"
 """Panels of the help; what has none stands in the first one, with the most common options."""
 
 
@@ -158,6 +161,12 @@ class Wishes:
     with_receivers: Annotated[bool, Option(
         "Give nodes that subscribe to the shaped output SCHED_FIFO, in the place that the plan"
         " has for them, while it is in force.", GATE, flag="--receivers/--no-receivers")] = True
+    in_step: Annotated[bool, Option(
+        "Put the output's slot so long before the loop's next instance that the age of its data is"
+        " constant, at each start anew.", LOOP)] = False
+    move_loop: Annotated[bool, Option(
+        "Instead, leave the slot where the latency is shortest, and move the loop: its thread's"
+        " sleep is made longer, once.", LOOP)] = False
 # fmt: on
 
 
@@ -197,3 +206,5 @@ class WishKeywords(TypedDict, total=False):
     slot_ends: SlotEnds
     best_effort: tuple[str, ...]
     with_receivers: bool
+    in_step: bool
+    move_loop: bool
