@@ -173,7 +173,7 @@ def apply_plan(
         _arm(supervision, progress)
         report.note(*why_not)
         followers.start(run_threads.latest, reaches_ns)
-        run.loops.start(followers, run_threads.latest)
+        run.loops.start(anchored, run_threads.latest)
         supervision.watch_over(watch)
         strangers = look_alikes(journal, groups_of(run_of(journal)))
     finally:

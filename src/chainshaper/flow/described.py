@@ -12,7 +12,7 @@ from chainshaper.enforcement.back_ends import choose_back_end, make_back_end
 from chainshaper.enforcement.guardian import run_claimed
 from chainshaper.flow.drift import SlotFollower
 from chainshaper.flow.followed_chains import followed_chains
-from chainshaper.flow.in_step import InStep, find_loop, loops_in_step, reach_of
+from chainshaper.flow.in_step import InStep, find_loop, loops_in_step
 from chainshaper.flow.server_tables import table_of
 from chainshaper.planning import ChainPlan
 from chainshaper.planning.chain_plan import Server, Thread
@@ -199,12 +199,11 @@ def loops_kept_in_step(
         if enforcement is not None:
             until.enter_context(enforcement(nodes))
         kept = list[InStep]()
-        for place, chain, loop in loops_in_step(plan):
+        for _, chain, loop in loops_in_step(plan):
             if loop.node not in nodes.pids:
                 raise InputError(f"{loop.node}, the plan's loop, is no node of the application")
             find = partial(find_loop, nodes.pids[loop.node], loop)
-            reach_ns, in_force = reach_of(plan, place), partial(in_force_from, chain)
-            step = InStep(chain, nodes.pids.values(), reach_ns, find, in_force)
+            step = InStep(chain, nodes.pids.values(), find, partial(in_force_from, chain))
             kept.append(step)
             until.callback(step.end)
         yield partial(_moves_of_loops, kept, nodes)

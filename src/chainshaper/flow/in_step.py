@@ -32,8 +32,7 @@ from chainshaper.planning.chain_plan import (
     publish_slots,
 )
 from chainshaper.planning.offsets import chain_name
-from chainshaper.planning.overruns import cycles_until_output
-from chainshaper.planning.plan import Plan, reach
+from chainshaper.planning.plan import Plan
 from chainshaper.sources.preload.moving import LoopMoved, LoopMover
 from chainshaper.splicing.shaped_outputs import FollowedOutput
 from chainshaper.values.durations import duration_text
@@ -60,29 +59,39 @@ class LoopStarts(Protocol):
 
 
 def next_move(
-    now_ns: int, wanted_ns: int, step_ns: int, range_ns: tuple[int, int], tolerance_ns: int
+    now_ns: int,
+    wanted_ns: int,
+    step_ns: int,
+    range_ns: tuple[int, int],
+    tolerance_ns: int = 0,
+    *,
+    otherwise_ns: int,
 ) -> int:
     """Return by how much to move, so that it is a wanted move but for whole steps.
 
     ``now_ns`` is the move in force, and is returned where it is near enough. ``range_ns`` has the
     smallest and the largest possible. Of those in the range the nearest is chosen; where none is,
-    the smallest possible one: what comes later than wanted loses nothing.
+    ``otherwise_ns``.
 
-        >>> next_move(0, 13, 10, (0, 9), 1)
+        >>> next_move(0, 13, 10, (0, 9), 1, otherwise_ns=0)
         3
-        >>> next_move(9, 10, 10, (0, 9), 0)
+        >>> next_move(9, 10, 10, (0, 9), otherwise_ns=0)
         0
-        >>> next_move(5, 26, 10, (0, 9), 2)
+        >>> next_move(5, 26, 10, (0, 9), 2, otherwise_ns=0)
         5
+        >>> next_move(5, 17, 10, (0, 6), otherwise_ns=6)
+        6
     """
     least, most = range_ns
     off = (wanted_ns - now_ns + step_ns // 2) % step_ns - step_ns // 2
     if abs(off) <= tolerance_ns and least <= now_ns <= most:
         return now_ns
     moved = now_ns + off
-    if not least <= moved <= most:
+    if moved < least:
         moved = least + (moved - least) % step_ns
-    return moved if moved <= most else least
+    elif moved > most:
+        moved = most - (most - moved) % step_ns
+    return moved if least <= moved <= most else otherwise_ns
 
 
 @dataclass
@@ -113,7 +122,6 @@ class InStep:
     * ``loop_moves``: what was added to the loop's sleeps, all that was seen.
     * ``chain``: one whose plan has a loop in step.
     * ``pids``: processes of which one may be the gate.
-    * ``reach_ns``: how far the output's slots may be moved, earlier and later.
     * ``find``: looks for the loop; it returns its starts until now as well, or None.
     * ``put_in_force``: has servers move their slots by so much (ns), and returns from when on the
       gate has to move its own.
@@ -126,7 +134,6 @@ class InStep:
         self,
         chain: ChainPlan,
         pids: Collection[int],
-        reach_ns: tuple[int, int],
         find: Callable[[], LoopStarts | None],
         put_in_force: Callable[[int], int],
         *,
@@ -141,11 +148,10 @@ class InStep:
         self.loop_moves: list[LoopMoved] = []
         self.chain, self.loop, self.period_ns = chain, loop, loop.period_ns
         self.step_ns, self._tolerance_ns = loop_common_ns(chain), tolerance_ns
-        # When the output leaves behind the beginning of its cycle, perhaps in the next one.
-        self._slot_ns = publish_slots(chain)[0][0] + cycles_until_output(chain) * chain.cycle_ns
-        if loop.earliest_start_ns is not None:
-            reach_ns = (max(reach_ns[0], loop.earliest_start_ns - self._slot_ns), reach_ns[1])
-        self._reach_ns, self._find, self._put_in_force = reach_ns, find, put_in_force
+        self._slot_ns = publish_slots(chain)[0][0]
+        starts = loop.starts_ns or (self._slot_ns, self._slot_ns)
+        self._reach_ns = starts[0] - self._slot_ns, starts[1] - self._slot_ns
+        self._find, self._put_in_force = find, put_in_force
         self._output = FollowedOutput(shaping.output, pids)
         self._origins = PhaseTrack(chain.cycle_ns, _ORIGINS_NS)
         self.tid = 0  # of the loop's thread, the latest that was found
@@ -270,7 +276,10 @@ class InStep:
         before = self._moved_ns
         # The loop's place is that of its own starts; a small step follows a drift, a large one not.
         wanted = output - loop.near(output)
-        moved = next_move(before or 0, wanted, self.step_ns, range_ns, self._tolerance_ns)
+        # Where the loop cannot be, it starts by itself: later than wanted, so it finds the output.
+        moved = next_move(
+            before or 0, wanted, self.step_ns, range_ns, self._tolerance_ns, otherwise_ns=0
+        )
         if moved != before:
             self._number = mover.move(moved, period_ns)
             self._moved_ns = moved
@@ -279,7 +288,15 @@ class InStep:
     def _move_output(self, loop: LoopPhase, origin: LoopPhase) -> None:
         before = self._moved_ns
         wanted = loop.near(origin.at_ns) - self.loop.lead_ns - origin.at_ns - self._slot_ns
-        moved = next_move(before or 0, wanted, self.step_ns, self._reach_ns, self._tolerance_ns)
+        # Before an instance in the next cycle the output leaves at the latest: it waits there.
+        moved = next_move(
+            before or 0,
+            wanted,
+            self.step_ns,
+            self._reach_ns,
+            self._tolerance_ns,
+            otherwise_ns=self._reach_ns[1],
+        )
         if moved != before:
             self._output.move(moved, self._put_in_force(moved))
             self._moved_ns = moved
@@ -343,14 +360,3 @@ def loops_in_step(plan: Plan, adapt: bool = False) -> list[tuple[int, ChainPlan,
             " latencies: leave out --adapt, or plan without --in-step"
         )
     return chains
-
-
-def reach_of(plan: Plan, place: int) -> tuple[int, int]:
-    """Return how far the slots of a chain in step may be moved (ns), earlier and later.
-
-    (0, 0): they stay, also where nothing needs them to move.
-    """
-    loop = plan.chains[place].loop
-    if loop is None or loop.in_step != "output":
-        return 0, 0
-    return reach(plan, place)

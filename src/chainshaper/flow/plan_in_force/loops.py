@@ -1,17 +1,22 @@
 """Loops that are kept in step with outputs while a plan is in force."""
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
 from chainshaper.enforcement.node_threads import Allocation
-from chainshaper.flow.in_step import InStep, LoopStarts, find_loop, loops_in_step, reach_of
-from chainshaper.flow.plan_in_force.followers import Followers
+from chainshaper.flow.in_step import InStep, LoopStarts, find_loop, loops_in_step
+from chainshaper.flow.plan_in_force.anchor import AnchoredPlan
 from chainshaper.flow.plan_in_force.report import RunReport
 from chainshaper.flow.polled_loop import PolledLoop
+from chainshaper.flow.server_tables import server_table
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.planning.chain_plan import PlannedLoop
+from chainshaper.planning.chain_plan import ChainPlan, PlannedLoop
+from chainshaper.planning.loops import with_output_alone_at
 from chainshaper.planning.offsets import chain_name
+from chainshaper.planning.plan import Plan
+from chainshaper.values.errors import OperationError
 
 
 @dataclass
@@ -21,19 +26,21 @@ class LoopsInStep:
     running: dict[int, InStep] = field(default_factory=dict)
     threads: Allocation = field(default_factory=lambda: Allocation((), ()))  # at the latest look
 
-    def start(self, followers: Followers, allocation: Allocation) -> None:
-        """Begin to keep the plan's loops in step. Raises OperationError: a gate is not there."""
-        plan = followers.anchored.given
-        cores = set(available_cores()) - {server.core for server in followers.anchored.plan.servers}
+    def start(self, anchored: AnchoredPlan, allocation: Allocation) -> None:
+        """Begin to keep the plan's loops in step.
+
+        Raises OperationError: a gate is not there, or it is in a server whose slots do not move.
+        """
+        cores = set(available_cores()) - {server.core for server in anchored.plan.servers}
         pids = [listed.thread.pid for listed in allocation.threads]
         self.threads = allocation
-        for place, chain, loop in loops_in_step(plan):
+        for place, chain, loop in loops_in_step(anchored.given):
+            _refuse_closed(anchored, chain)
             self.running[place] = InStep(
                 chain,
                 pids,
-                reach_of(plan, place),
                 partial(self.find, loop),
-                partial(followers.move_slots, place),
+                partial(in_force_from, anchored, place),
                 cores=cores,
             )
 
@@ -70,6 +77,29 @@ class LoopsInStep:
         """Slots and loops go back to where the plan, and the loops themselves, have them."""
         for kept in self.running.values():
             kept.end()
+
+
+def in_force_from(anchored: AnchoredPlan, place: int, _moved_ns: int) -> int:
+    """Return from when on a chain's gate has its slots elsewhere: in the middle of a cycle (ns)."""
+    with anchored.lock:
+        cycle_ns = anchored.plan.chains[place].cycle_ns
+        since = time.monotonic_ns() + 2 * cycle_ns
+        return since + (anchored.begins(place) - since) % cycle_ns - cycle_ns // 2
+
+
+def _refuse_closed(anchored: AnchoredPlan, chain: ChainPlan) -> None:
+    """Refuse to move a gate's slots where the back end keeps its thread in those of the plan.
+
+    Raises OperationError.
+    """
+    if chain.loop is None or chain.loop.starts_ns is None or not anchored.gated:
+        return
+    moved = Plan.of(with_output_alone_at(chain, chain.loop.starts_ns[1]))
+    if server_table(moved) != server_table(Plan.of(chain)):
+        raise OperationError(
+            f"the back end {anchored.back_end} keeps the shaping node of {chain_name(chain)} in its"
+            " planned slot, which has to move with the loop: plan with --shaping-thread free"
+        )
 
 
 def _missing(named: str, kept: InStep) -> Sequence[str]:
