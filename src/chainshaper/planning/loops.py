@@ -78,7 +78,7 @@ def with_loop(plan: ChainPlan, profile: Profile, wishes: Wishes) -> ChainPlan:
     planned = _planned(plan, loop, wishes)
     if in_step is not None:
         _refuse_step(plan, loop, planned, in_step)
-        return stated(_in_step(plan, planned, in_step))
+        return stated(_in_step(plan, planned, in_step, loop.before_ns))
     plan = plan.model_copy(update={"loop": planned})
     if plan.policy == "shaped" and planned.period_ns is not None and not planned.drift_ppm:
         plan = _without_straddling(plan)
@@ -391,7 +391,7 @@ def _refuse_step(
         )
     ((start, _),) = publish_slots(plan)
     # Before an instance in the next cycle the slot ends with its own, so much sooner at most.
-    sooner = max(0, start + common - 1 - _latest_start(plan))
+    sooner = max(0, start + common - 1 - _latest_start(plan, recorded.before_ns))
     if in_step == "output" and sooner + stored + loop.jitter_ns > common:
         raise OperationError(
             f"{option}: the slot has to start behind {duration_text(start)}, and to end with the"
@@ -404,14 +404,14 @@ def _refuse_step(
         )
 
 
-def _in_step(plan: ChainPlan, loop: PlannedLoop, in_step: InStep) -> ChainPlan:
+def _in_step(plan: ChainPlan, loop: PlannedLoop, in_step: InStep, before_ns: int) -> ChainPlan:
     """Return the plan with slot and loop in step."""
     ((start, end),), cycle = publish_slots(plan), plan.cycle_ns
     common = math.gcd(cycle, loop.period_ns or cycle)
     if in_step == "loop":
         move = move_into_step(start, loop.lead_ns, loop.phase_ns, common)
         return revised(plan, loop=loop.model_copy(update={"in_step": in_step, "move_ns": move}))
-    starts = (start, _latest_start(plan))
+    starts = (start, _latest_start(plan, before_ns))
     begins = start_in_step(starts, loop.lead_ns, loop.phase_ns, common)
     return revised(
         with_output_alone_at(plan, begins),
@@ -420,11 +420,14 @@ def _in_step(plan: ChainPlan, loop: PlannedLoop, in_step: InStep) -> ChainPlan:
     )
 
 
-def _latest_start(plan: ChainPlan) -> int:
-    """Return where a slot starts at the latest: it ends, and its gate is done, with the cycle."""
+def _latest_start(plan: ChainPlan, before_ns: int) -> int:
+    """Return where a slot starts at the latest: it ends, and its gate is done, with the cycle.
+
+    It starts ``before_ns`` sooner, where outputs of other chains leave behind it.
+    """
     ((start, end),), node = publish_slots(plan), plan.shaping_node
     done_ns = 0 if node is None else node_work_ns(plan, node) - node.spin_ns + node.pause_ns
-    return max(start, plan.cycle_ns - max(end - start, done_ns))
+    return max(start, plan.cycle_ns - max(end - start, done_ns) - before_ns)
 
 
 def with_output_alone_at(plan: ChainPlan, start_ns: int) -> ChainPlan:

@@ -522,10 +522,8 @@ def _about_loop(plan: ChainPlan) -> Iterator[str]:
     elif loop.in_step is None and plan.policy not in plans.UNSHAPED:
         ages = tuple(map(milliseconds, (loop.age_at_any_phase or loop.age).first_ns))
         text = f"the phase of {named} is another one at each start of it: the age at the first use"
-        text += (
-            f" lies between {milliseconds(low)} and {milliseconds(high)} ms then. --in-step puts"
-        )
-        yield f"{text} the slot before its instances at each start, --move-loop moves the loop."
+        text += f" lies between {ages[0]} and {ages[1]} ms then. --in-step puts the slot before its"
+        yield f"{text} instances at each start, --move-loop moves the loop."
     elif loop.in_step == "loop":
         text = f"{named} has to start {milliseconds(loop.move_ns or 0)} ms later than it was"
         yield f"{text} recorded; how much it is, is measured at each start."

@@ -138,8 +138,9 @@ def phase_of(starts: _Times, cycles: _Times, common_ns: int) -> Phase:
     drifted = abs(slope) * -elapsed[0]
     error = float(np.std(rest)) * math.sqrt(12 / len(rest))
     if drifted < max(_SIGNIFICANT * error, _LEAST_DRIFT_NS):
-        slope, at_end = 0.0, float(np.median(unwrapped))
-        rest = unwrapped - at_end
+        usual = round(float(np.median(unwrapped)))
+        slope, at_end = 0.0, float(usual)
+        rest = (behind - usual + common_ns // 2) % common_ns - common_ns // 2  # whole ns
     if np.subtract(*np.percentile(rest, (75, 25))) > common_ns / 4:  # there is no usual phase
         return Phase(0, common_ns, 0.0)
     early, late = np.percentile(rest, (0.5, 99.5))
