@@ -15,6 +15,7 @@ import argparse
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import polars as pl
@@ -121,7 +122,7 @@ def _application(folder: Path, period_ns: int, phase_us: int) -> Application:
     return cs.load_application(path)
 
 
-def _in_step(chain: cs.ChainPlan, period_ns: int, moved: str) -> Plan:
+def _in_step(chain: cs.ChainPlan, period_ns: int, moved: Literal["output", "loop"]) -> Plan:
     """The chain's plan with the loop in step; phases are measured when it runs.
 
     It is made by hand: for the loop's own clock, which differs, no recording is needed.
@@ -164,7 +165,7 @@ def _row(recording: Recording) -> list[str]:
         moves = int((gates["moved"].diff().fill_null(0) != 0).sum())
     return [
         *(milliseconds(float(figure)) for figure in (low, usual, high, first.max(), high - low)),
-        milliseconds(int(cycles["age_at_loop_ns"].max() or 0)),
+        milliseconds(float(cycles["age_at_loop_ns"].to_numpy().max())),
         str(cycles.height),
         str(first.size),
         str(age.uses["never"]),

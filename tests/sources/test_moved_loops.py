@@ -180,7 +180,8 @@ def running(program: Path, folder: Path, *words: object) -> Iterator[Running]:
         finally:
             process.kill()
             process.wait()
-            process.stdout.close()
+            if process.stdout is not None:
+                process.stdout.close()
         tracer.stop()
         tables.update(tracer.recording()[0])
     finally:

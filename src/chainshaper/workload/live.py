@@ -308,7 +308,7 @@ def _start_nodes(
         nodes[name] = launcher.start_child(
             f"node {name}",
             "chainshaper.workload.node_process",
-            environment | (loops_in_front if application.nodes[name].loop is not None else {}),
+            {**environment, **(loops_in_front if application.nodes[name].loop is not None else {})},
             arguments=("--ros-args", "-r", f"__node:={base}", "-r", f"__ns:={namespace or '/'}"),
             libraries=LIBRARIES,
         )

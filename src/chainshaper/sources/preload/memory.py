@@ -205,7 +205,7 @@ class TracedProcess:
     @property
     def taken(self) -> NDArray[np.uint32]:
         """The thread that has each ring, by its id in its container; 0: none has it."""
-        return self._rings["taken"].copy()
+        return np.array(self._rings["taken"], np.uint32)
 
     def _good(self, records: NDArray[Any], known: NDArray[np.bool_]) -> int:
         """Return how many records stand before the first that the library cannot have written.
