@@ -12,7 +12,7 @@ from chainshaper.enforcement.back_ends import choose_back_end, make_back_end
 from chainshaper.enforcement.guardian import run_claimed
 from chainshaper.flow.drift import SlotFollower
 from chainshaper.flow.followed_chains import followed_chains
-from chainshaper.flow.in_step import InStep, find_loop, loops_in_step
+from chainshaper.flow.in_step import InStep, find_loop, loops_in_step, with_loops_as_they_are
 from chainshaper.flow.server_tables import table_of
 from chainshaper.planning import ChainPlan
 from chainshaper.planning.chain_plan import Server, Thread
@@ -72,7 +72,7 @@ def shape_application(
         enforcement = partial(slots_followed, plan, reaches_ns, enforcement)
     try:
         return run_application(
-            splice_application(application, plan),
+            splice_application(application, with_loops_as_they_are(plan)),
             output,
             cycles=cycles,
             realtime=realtime,

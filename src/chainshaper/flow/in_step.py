@@ -30,6 +30,7 @@ from chainshaper.planning.chain_plan import (
     PlannedLoop,
     loop_common_ns,
     publish_slots,
+    revised,
 )
 from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.plan import Plan
@@ -342,6 +343,20 @@ def find_loop(pid: int, loop: PlannedLoop, lease_ns: int = 5_000_000_000) -> Loo
         if phase_of(starts[-200:], loop.period_ns or 0) is not None:
             return LoopMover(pid, thread.tid, lease_ns)
     return None
+
+
+def with_loops_as_they_are(plan: Plan) -> Plan:
+    """Return a plan for an application whose loops are not moved by its description.
+
+    They are moved while they run, from where they start by themselves.
+    """
+    chains = (
+        chain
+        if chain.loop is None or not chain.loop.move_ns
+        else revised(chain, loop=chain.loop.model_copy(update={"move_ns": 0}))
+        for chain in plan.chains
+    )
+    return Plan.of(*chains)
 
 
 def loops_in_step(plan: Plan, adapt: bool = False) -> list[tuple[int, ChainPlan, PlannedLoop]]:
