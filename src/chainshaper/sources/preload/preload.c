@@ -780,7 +780,7 @@ enum { ASKED, KEPT, FOLLOWED, RATE_CHANGED, OVER };  // places in LOOP_MOVES
 #define EXACT 20000             // ns: steps of a loop with its own instants differ by no more
 #define PLAIN (4 * EXACT)       // a move by more shows where the loop counts from
 #define SHORTEN 16              // a sleep is made shorter by no more than this part of the period
-#define MOST_AGAINST 6u
+#define MOST_AGAINST 12u         // three signs in turn that the loop follows, six of instances left out
 #define LONGEST_PERIOD 10000000000u
 #define SHORTEST_PERIOD 10000u
 
@@ -835,7 +835,7 @@ static void see_step(int64_t step) {
   bool follows = size_of(off) > EXACT && size_of(off - kept) < size_of(off);
   bool leaves_out = step > (int64_t)(thread.loop.period + thread.loop.period / 2);
   if (follows || leaves_out)
-    thread.loop.against += 2;
+    thread.loop.against += follows ? 4 : 2;
   else if (thread.loop.against)
     thread.loop.against--;
   if (thread.loop.against < MOST_AGAINST) return;
