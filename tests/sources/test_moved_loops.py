@@ -1,5 +1,6 @@
 """Loops that are moved by the library in front of ROS 2: real programs, each with its own loop."""
 
+import contextlib
 import shutil
 import signal
 import subprocess
@@ -162,10 +163,12 @@ def wait_for(condition: Callable[[], object], within_s: float = 30.0) -> "LoopMo
 
 
 @contextmanager
-def running(program: Path, folder: Path, *words: object) -> Iterator[Running]:
+def running(
+    program: Path, folder: Path, *words: object, loops: tuple[str, ...] = ()
+) -> Iterator[Running]:
     """Run a loop beneath the library; what was recorded is there when the context has ended."""
     folder.mkdir(exist_ok=True)
-    tracer = PreloadTracer(folder, ["command"], ())
+    tracer = PreloadTracer(folder, ["command"], (), None, loops)
     tables: dict[str, pl.DataFrame] = {}
     try:
         with pytest.MonkeyPatch.context() as patch:
@@ -400,3 +403,64 @@ def test_two_processes_that_ask_leave_a_whole_request(program: Path, tmp_path: P
             thread.join()
     moved = loop.tables["loop_moved"]
     assert set(moved["asked"]) <= {2 * MS, 4 * MS}
+
+
+UPDATE_THREAD = r"""
+#include <dlfcn.h>
+#include <pthread.h>
+#include <sched.h>
+#include <chrono>
+#include <cstdint>
+#include <cstdio>
+#include <thread>
+
+int main() {
+  using create = void (*)(uint64_t, uint64_t, const char *, const char *, uint64_t);
+  if (auto created = reinterpret_cast<create>(dlsym(RTLD_DEFAULT, "ros_trace_rcl_node_init")))
+    created(1, 2, "controller_manager", "/", 0);
+  std::thread([] {
+    pthread_setname_np(pthread_self(), "control_loop");
+    sched_param priority{};
+    priority.sched_priority = 60;
+    sched_setscheduler(0, SCHED_FIFO, &priority);
+    const auto period = std::chrono::milliseconds(10);
+    auto next = std::chrono::steady_clock::now();
+    std::puts("ready");
+    std::fflush(stdout);
+    for (;;) {
+      const auto until = std::chrono::steady_clock::now() + std::chrono::microseconds(200);
+      while (std::chrono::steady_clock::now() < until) continue;
+      next += period;
+      std::this_thread::sleep_until(next);
+    }
+  }).join();
+}
+"""
+"""As ros2_control's: the thread publishes nothing, and is named; its node is in the process."""
+
+
+@pytest.mark.parametrize("sanitizer", [(), ("-fsanitize=address",)], ids=["plain", "asan"])
+def test_an_update_thread_in_cpp_that_was_named_is_moved(
+    tmp_path: Path, sanitizer: tuple[str, ...]
+) -> None:
+    program = tmp_path / "manager"
+    words = ["g++", "-O1", "-std=c++17", *sanitizer, "-x", "c++", "-", "-o", str(program)]
+    subprocess.run([*words, "-lpthread", "-ldl"], input=UPDATE_THREAD.encode(), check=True)
+    with running(program, tmp_path / "trace", loops=("control_loop",)) as loop:
+
+        def found() -> LoopMover | None:
+            for thread in list_threads(loop.pid):
+                if thread.comm == "control_loop":
+                    with contextlib.suppress(OperationError):
+                        return LoopMover(loop.pid, thread.tid, 0)
+            return None
+
+        mover = wait_for(found)
+        before = seen_until(mover, 40)
+        settled(mover, mover.move(3 * MS, PERIOD))
+        after = seen_until(mover, 40)
+        assert abs(moved_by(before, after) - 3 * MS) < NEAR
+    assert loop.tables["loop_named"]["name"].to_list() == ["control_loop"]
+    moved = loop.tables["loop_moved"]
+    assert moved["kept"].to_list() == [0, 3 * MS]
+    assert set(loop.tables["thread_sleep"]["tid"]) == {mover.tid}
