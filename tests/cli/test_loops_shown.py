@@ -68,3 +68,32 @@ def test_the_report_has_the_age_of_the_loops_data(recording: Path, tmp_path: Pat
 def test_a_loop_is_named_for_the_library_in_front_only(tmp_path: Path, source: str) -> None:
     words = ("record", "-o", tmp_path / "r", "--source", source, "--loop", "/a", "--", "true")
     assert "leave out --loop" in refused(2, *words)
+
+
+def test_plan_states_the_age_at_the_loop_and_puts_the_slot_before_it(
+    recording: Path, tmp_path: Path
+) -> None:
+    """The sensor sends 1 ms behind its start; 9 to 11 ms later it is stored."""
+    chain = (recording, "--chain", "/a../cmd", "--epsilon", "1ms")
+    planned = json_of("plan", *chain)
+    loop = planned["loop"]
+    assert (planned["chain"]["spec"], loop["chain"]) == ("/a", "/a../cmd")
+    assert (loop["node"], loop["topic"], loop["period_ns"]) == ("/actor", "/a", 100 * MS)
+    assert loop["delivery_ns"] == [9 * MS, 11 * MS, 11 * MS]
+    assert loop["age"]["first_ns"] == [100 * MS, 100 * MS]
+    assert (loop["age"]["constant"], loop["age"]["uses"]) == (True, [2, 2])
+    assert any("--in-step puts the slot" in warning for warning in planned["warnings"])
+    text = called("plan", *chain).out
+    assert "loop of /actor, every 100 ms" in text
+    output = tmp_path / "plan.yaml"
+    in_step = json_of("plan", *chain, "--in-step", "-o", output)
+    # The lead is 11 ms and a quarter of that.
+    assert in_step["servers"][1]["slots"] == [[86_250_000, 87_250_000]]
+    assert "in_step: output" in output.read_text()
+    moved = json_of("plan", *chain, "--move-loop")
+    assert moved["servers"][1]["slots"] == [[2 * MS, 3 * MS]]
+    assert moved["loop"]["move_ns"] == 15_750_000  # from 0 to 2 + 13.75 ms, modulo 100
+    assert moved["loop"]["age"]["first_ns"] == [15_750_000, 15_750_000]
+    assert "give one of the two" in refused(2, "plan", *chain, "--in-step", "--move-loop")
+    without = refused(2, "plan", recording, "--chain", "/a", "--in-step")
+    assert "goes through no loop" in without

@@ -200,6 +200,35 @@ def test_executors_are_told_apart_by_the_order_in_which_an_earlier_run_started_t
             server_members(ticks, found)
 
 
+LOOPING = RecordedProcess(
+    100,
+    ("/x",),
+    (
+        RecordedThread(100, "executor", ("/x",), "main"),
+        RecordedThread(101, "dds", ("/x",), "recv"),
+        RecordedThread(102, "loop", ("/x",), "main"),  # it has the name of the program, too
+    ),
+    seen_ns=0,
+)
+
+
+@pytest.mark.parametrize(
+    ("names", "roles"),
+    [
+        (["recv", "main"], ["executor", "dds", "loop"]),
+        (["gc", "main", "recv"], ["executor", "dds", "loop", "dds"]),
+        (["recv"], ["executor", "dds"]),  # the loop has not begun
+    ],
+)
+def test_the_thread_of_a_loop_is_known_by_an_earlier_run(
+    names: list[str], roles: list[str]
+) -> None:
+    """It is a thread of its node, also where the main thread alone executes callbacks."""
+    found = allocate([_process(700, X, *names)], [LOOPING])
+    assert [listed.thread.role for listed in found.threads] == roles
+    assert all(listed.nodes == ("/x",) for listed in found.threads if listed.thread.role == "loop")
+
+
 RUN = _process(50, f"ros2 run p {X}", participates=False)
 NODE = _process(100, X, "recv", parent=50)
 SUDO = _process(50, f"sudo {X}", participates=False)

@@ -20,6 +20,7 @@ from chainshaper.planning import (
 )
 from chainshaper.planning.chain_plan import PlannedLoop, loop_common_ns
 from chainshaper.planning.loop_ages import LoopTimes, straddles
+from chainshaper.planning.overruns import why_not_followed
 from chainshaper.planning.profile import Reception, RecordedLoop
 from chainshaper.planning.request import PlanRequest
 from chainshaper.planning.shaping import CallbackTimes
@@ -204,6 +205,12 @@ def test_in_step_the_slot_lies_the_lead_before_the_loop(
     assert whichever.first_ns == (9_500_000, 9_500_000 + common - 1 + 50 * US)
     chain, _ = plan.servers
     assert chain.slots == ((0, 9 * MS),), "the chain is done then"
+
+
+def test_slots_in_step_do_not_follow_latencies() -> None:
+    assert why_not_followed(planned()[0]) is None
+    reason = "they are in step with the loop of /controller"
+    assert why_not_followed(planned(in_step=True)[0]) == reason
 
 
 def test_a_loop_is_moved_behind_the_slot() -> None:

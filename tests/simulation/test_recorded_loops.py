@@ -1,5 +1,6 @@
 """What a recording says of the loop that a chain goes through, and plans that are made from it."""
 
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from chainshaper.analysis import recorded_flow
 from chainshaper.analysis.chains import find_chain
 from chainshaper.analysis.graph import graph_of
 from chainshaper.flow.plan import plan_recording, profile_chains
+from chainshaper.flow.recorded_processes import recorded_processes
 from chainshaper.flow.recorded_profile.loops import before_loop, phase_of
 from chainshaper.simulation import simulate
 from chainshaper.sources import open_source
@@ -120,3 +122,13 @@ def test_too_few_instances_are_refused(tmp_path: Path) -> None:
     simulate(application(CHAIN, **COSTS), tmp_path / "short", cycles=4)
     with pytest.raises(InputError, match="instances, too few to plan with: record longer"):
         profile_chains(tmp_path / "short", ["/scan../command"])
+
+
+def test_the_thread_of_a_recorded_loop_is_known_as_that(tmp_path: Path) -> None:
+    """In the example, /controller is process 200, and its loop the thread 203."""
+    examples = Path(__file__).parents[2] / "examples"
+    runpy.run_path(str(examples / "write_loop.py"))["main"](str(tmp_path / "loop"))
+    processes, _ = recorded_processes(open_source(tmp_path / "loop"))
+    threads = {thread.tid: thread for process in processes for thread in process.threads}
+    assert (threads[203].role, threads[203].nodes) == ("loop", ("/controller",))
+    assert threads[200].role == "executor"

@@ -5,11 +5,12 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
-from chainshaper.analysis import LatencyAnalysis, analyse_latency, recorded_flow
+from chainshaper.analysis import DataFlow, LatencyAnalysis, analyse_latency, recorded_flow
 from chainshaper.analysis.chains import find_chain
 from chainshaper.analysis.contradictions import refuse_contradicted
+from chainshaper.analysis.data_age import LoopReading
 from chainshaper.analysis.graph import graph_of
 from chainshaper.flow.recorded_profile.chain_profile import profile_of
 from chainshaper.flow.recorded_profile.loops import before_loop, recorded_loop
@@ -63,14 +64,8 @@ def profile_chains(
         until = None if until_ns is None else begun + until_ns
         recording = replace(recording, events=events.happened(all_events, begun + since_ns, until))
     flow = recorded_flow(recording)
-    graph = graph_of(flow)
-    named = [find_chain(graph, chain_of(recording, chain, flow)) for chain in chains]
-    before = [before_loop(flow, chain) for chain in named]
-    analyses = [analyse_latency(flow, of_chain.chain) for of_chain in before]
-    whole = [
-        None if reading is None else analyse_latency(flow, chain)
-        for chain, (_, reading) in zip(named, before, strict=True)
-    ]
+    measured = [_measured(flow, chain_of(recording, chain, flow)) for chain in chains]
+    analyses = [of_chain.analysis for of_chain in measured]
     stages = [graph_stages(analysis.graph, analysis.chain) for analysis in analyses]
     planned = {number for of_chain in stages for stage in of_chain for number in stage.members}
     chained = {number for analysis in analyses for number in analysis.chain.callbacks}
@@ -87,12 +82,10 @@ def profile_chains(
             planned=planned,
         )
 
-    profiles = [profiled(*measured) for measured in zip(analyses, stages, strict=True)]
-    for place, (through, (_, reading)) in enumerate(zip(whole, before, strict=True)):
-        if through is not None and reading is not None:
-            period = profiles[place].period_ns
-            loop = recorded_loop(recording, flow, through, reading, period)
-            profiles[place] = replace(profiles[place], loop=loop)
+    profiles = [
+        _with_loop(profiled(of_chain.analysis, of_graph), recording, flow, of_chain)
+        for of_chain, of_graph in zip(measured, stages, strict=True)
+    ]
     if modes is None:
         return tuple(profiles)
     if unknown := ", ".join(mode_recordings.keys() - modes.bands.keys()):
@@ -122,6 +115,32 @@ def profile_chains(
                     of_modes[mode] = profiled(replace(analysis, traversals=within), stages[place])
         profiles[place] = replace(profiles[place], of_modes=of_modes)
     return tuple(profiles)
+
+
+class _Measured(NamedTuple):
+    """A chain before its last loop; that loop, and the chain through it (None: it has no loop)."""
+
+    analysis: LatencyAnalysis
+    reading: LoopReading | None
+    through: LatencyAnalysis | None
+
+
+def _measured(flow: DataFlow, spec: str) -> _Measured:
+    """Return the analysis of a chain. Raises InputError: as :func:`profile_chains`."""
+    chain = find_chain(graph_of(flow), spec)
+    before, reading = before_loop(flow, chain)
+    through = None if reading is None else analyse_latency(flow, chain)
+    return _Measured(analyse_latency(flow, before), reading, through)
+
+
+def _with_loop(
+    profile: Profile, recording: Recording, flow: DataFlow, measured: _Measured
+) -> Profile:
+    """Return a profile with what was measured of the loop that reads the output, if any."""
+    if measured.reading is None or measured.through is None:
+        return profile
+    loop = recorded_loop(recording, flow, measured.through, measured.reading, profile.period_ns)
+    return replace(profile, loop=loop)
 
 
 @contextmanager

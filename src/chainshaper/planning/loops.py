@@ -125,19 +125,6 @@ def one_before_another(
     return placed
 
 
-def at_other_offsets(plan: ChainPlan) -> ChainPlan:
-    """Return the plan of a chain that begins at another time than when it was recorded.
-
-    With what phase the loop starts behind it then is not known, unless one of the two is moved.
-    """
-    loop = plan.loop
-    if loop is None or loop.in_step is not None or loop.age_at_any_phase is None:
-        return plan
-    return plan.model_copy(
-        update={"loop": loop.model_copy(update={"age": loop.age_at_any_phase, "moved_ns": 0})}
-    )
-
-
 def stated(plan: ChainPlan) -> ChainPlan:
     """Return a plan whose loop states the ages that come of the plan's slots."""
     loop = plan.loop

@@ -157,7 +157,22 @@ def place_chains(
     else:
         remarks = []
     _refuse_outputs_behind_others(turns)
-    return with_gates_level(turns), remarks
+    level = with_gates_level(turns)
+    if len(groups) > 1:
+        level = tuple(map(_at_other_offset, level))
+    return level, remarks
+
+
+def _at_other_offset(plan: ChainPlan) -> ChainPlan:
+    """Return the plan of a chain that begins at another time than when it was recorded.
+
+    With what phase a loop that reads its output starts then is not known, unless it is in step.
+    """
+    loop = plan.loop
+    if loop is None or loop.in_step is not None or loop.age_at_any_phase is None:
+        return plan
+    at_any_phase = {"age": loop.age_at_any_phase, "moved_ns": 0}
+    return plan.model_copy(update={"loop": loop.model_copy(update=at_any_phase)})
 
 
 def _longest_alone(apart: Callable[..., tuple[ChainPlan, ...]]) -> tuple[ChainPlan, ...] | None:

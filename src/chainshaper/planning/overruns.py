@@ -244,6 +244,8 @@ def why_not_followed(plan: ChainPlan) -> str | None:
         return f"under {plan.policy} slots are where the policy has them"
     if plan.modes is not None:
         return "each mode has latencies and a slot of its own, and one promise is for all"
+    if plan.loop is not None and plan.loop.in_step is not None:
+        return f"they are in step with the loop of {plan.loop.node}"
     if plan.shaping_node is None:
         return "no shaping node sees when outputs come (plan with --publication synchronous)"
     if plan.further_shaping_nodes:

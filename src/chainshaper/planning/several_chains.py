@@ -190,9 +190,7 @@ def _planned(
     ]
     placed = tuple(with_receivers_placed(placed, with_places))
     placed = tuple(
-        loops.with_thread_placed(
-            chain_plan if len(groups) == 1 else loops.at_other_offsets(chain_plan), profile, placed
-        )
+        loops.with_thread_placed(chain_plan, profile, placed)
         for chain_plan, profile in zip(placed, with_places, strict=True)
     )
     return Plan.of(*with_best_effort(placed, best_effort_cores(profiles, request))), remarks
