@@ -33,7 +33,8 @@ from chainshaper.workload.description import Application
 MS = 1_000_000
 SENSOR_NS = 20 * MS
 LEAD_NS = 1 * MS  # from the output to the loop's start: delivery, and a margin
-MARGIN_NS = 4 * MS
+CHAIN_NS = 3 * MS, 9 * MS  # how long the chain takes, as it is described
+MARGIN_NS = 3 * MS  # for what the machine adds
 SLOT_NS = 3 * MS  # with which the output's gate is done, at the end of a cycle
 SETTLED_NS = 4_000_000_000  # by then output and loop are in step
 TEXT = """\
@@ -93,9 +94,15 @@ def _runs(
         unshaped = cs.open_recording(profile_path)
     else:
         unshaped = cs.run_application(application, profile_path, cycles=max(cycles // 2, 250))
-    # The machine's stalls are left out, and the slot has room for what is later than most.
-    wishes = cs.PlanRequest(percentile=99.0, epsilon_ns=MARGIN_NS)
-    (chain,) = cs.plan_recording(unshaped, "/scan../filtered", wishes).chains
+    chain = cs.plan_shaping(
+        np.array(CHAIN_NS),
+        SENSOR_NS,
+        spec="/scan../filtered",
+        output="/filtered",
+        publisher="/filter",
+        nodes=("/sensor", "/filter"),
+        epsilon_ns=MARGIN_NS,
+    )
     drifting = round(period_ns * (1 + chosen.drift * 1e-6))
     rows: dict[str, tuple[Plan, int]] = {
         "unshaped": (Plan.of(chain), period_ns),
