@@ -159,7 +159,8 @@ class InStep:
         self._mover: LoopStarts | None = None
         self._loops, self._own, self._restarts = PhaseTrack(self.period_ns), OwnStarts(), 0
         self._moved_ns: int | None = None  # of what is moved; None: it was not, since it started
-        self._number = 0  # of the latest request to the loop
+        self._elsewhere = False  # one of the two starts elsewhere since the latest move
+        self._late_ns = 0  # the loop cannot be where it is to be, and starts so much later
         self._unreachable_ns = self.period_ns  # from here on a move changes the loop's rate
         self._looks = 0
         self._cores, self._stop = cores, threading.Event()
@@ -173,12 +174,15 @@ class InStep:
 
     @property
     def is_in_step(self) -> bool:
-        """Whether both have been brought into step since the loop was found."""
-        return self._mover is not None and self._moved_ns is not None
+        """Whether both have been brought into step since the loop was found, and still are."""
+        return self._mover is not None and self._moved_ns is not None and not self._late_ns
 
     @property
     def waits_for(self) -> str:
         """What is not known yet, or is out of reach."""
+        if self._late_ns:
+            late = duration_text(self._late_ns)
+            return f"the loop has too little time left to be moved, and starts {late} later"
         if self._loops.phase is None:
             return "the loop's phase is being measured, or it sleeps irregularly"
         if self._origins.phase is None:
@@ -227,7 +231,11 @@ class InStep:
     def look(self) -> None:
         """Look where both are, and move what is to be moved."""
         self._looks += 1
+        restarts = self._origins.restarts
         self._origins.saw(self._output.origins(self.chain.cycle_ns))
+        if self._origins.restarts > restarts:
+            self._elsewhere = True
+            self._note(None, "the chain begins elsewhere now: its phase is measured anew")
         self._look_at_loop()
         loop, origin = self._loops.phase, self._origins.phase
         if self._mover is None or loop is None or origin is None:
@@ -248,7 +256,7 @@ class InStep:
             self._mover = self._find()
             self._loops, self._own = PhaseTrack(self.period_ns), OwnStarts()
             self._moved_ns = self._moved_ns if self.loop.in_step == "output" else None
-            self._restarts, self._number = 0, 0
+            self._restarts, self._late_ns, self._unreachable_ns = 0, 0, self.period_ns
             if self._mover is None:
                 return
             self.tid = self._mover.tid
@@ -256,7 +264,7 @@ class InStep:
         self.loop_moves += moves
         self._loops.saw(self._own.of(starts, moves))
         if self._loops.restarts > self._restarts:
-            self._restarts = self._loops.restarts
+            self._restarts, self._elsewhere = self._loops.restarts, True
             self._note(None, "the loop starts elsewhere now: its phase is measured anew")
         if self.loop.in_step == "loop":
             self._mover.renew()
@@ -281,10 +289,12 @@ class InStep:
         moved = next_move(
             before or 0, wanted, self.step_ns, range_ns, self._tolerance_ns, otherwise_ns=0
         )
+        late_ns = (moved - wanted) % self.step_ns
+        is_late = self._tolerance_ns < late_ns < self.step_ns - self._tolerance_ns
+        self._late_ns = late_ns if is_late else 0
         if moved != before:
-            self._number = mover.move(moved, period_ns)
-            self._moved_ns = moved
-            self._note(moved, _why(before, moved, loop, origin, self.step_ns))
+            mover.move(moved, period_ns)
+            self._has_moved(before, moved, loop, origin)
 
     def _move_output(self, loop: LoopPhase, origin: LoopPhase) -> None:
         before = self._moved_ns
@@ -300,8 +310,23 @@ class InStep:
         )
         if moved != before:
             self._output.move(moved, self._put_in_force(moved))
-            self._moved_ns = moved
-            self._note(moved, _why(before, moved, loop, origin, self.step_ns))
+            self._has_moved(before, moved, loop, origin)
+
+    def _has_moved(
+        self, before: int | None, moved_ns: int, loop: LoopPhase, origin: LoopPhase
+    ) -> None:
+        """Note a move, and why."""
+        if before is None:
+            spread = duration_text(round(loop.spread_ns, -3))
+            why = f"its phase was measured in {loop.starts} starts, which spread over {spread}"
+        elif self._elsewhere:
+            why = "it was measured anew"
+        elif abs(moved_ns - before) > self.step_ns // 2:
+            why = "the drift has moved it to the end of what is possible, so it goes a step further"
+        else:
+            why = f"the clocks drift apart by {loop.drift_ppm - origin.drift_ppm:+.1f} ppm"
+        self._moved_ns, self._elsewhere = moved_ns, False
+        self._note(moved_ns, why)
 
     def _note(self, moved_ns: int | None, why: str) -> None:
         loop = self._loops.phase
@@ -315,15 +340,6 @@ class InStep:
             why=why,
         )
         self.steps = (*self.steps, step)[-STEPS:]
-
-
-def _why(before: int | None, moved: int, loop: LoopPhase, origin: LoopPhase, step_ns: int) -> str:
-    if before is None:
-        spread = duration_text(round(loop.spread_ns, -3))
-        return f"its phase was measured in {loop.starts} starts, which spread over {spread}"
-    if abs(moved - before) > step_ns // 2:
-        return "the drift has moved it to the end of what is possible, so it goes on a step further"
-    return f"the clocks drift apart by {loop.drift_ppm - origin.drift_ppm:+.1f} ppm"
 
 
 def find_loop(pid: int, loop: PlannedLoop, lease_ns: int = 5_000_000_000) -> LoopMover | None:

@@ -109,4 +109,4 @@ def _missing(named: str, kept: InStep) -> Sequence[str]:
     if not kept.has_loop:
         remedy = "start it beneath the library in front: `chainshaper watch -- COMMAND`"
         return (f"{named} are not in step: no such loop is seen to sleep; {remedy}",)
-    return (f"{named} are not in step yet: {kept.waits_for}",)
+    return (f"{named} are not in step now: {kept.waits_for}",)

@@ -87,6 +87,7 @@ class LoopMover:
         self.ring = int(taken[0])
         self._asked: Any = heads["asked"][self.ring]
         self._number = int(self._asked["number"])
+        self._has_asked = False
 
     def __enter__(self) -> "LoopMover":
         return self
@@ -140,17 +141,18 @@ class LoopMover:
                 f"a loop is moved by less than its period of {period_ns} ns, not by {move_ns} ns"
             )
         self._number += 1
+        self._has_asked = True
         self._write(move_ns, period_ns)
         return self._number
 
     def renew(self) -> None:
-        """Have the latest request in force for another lease."""
-        asked = self._asked
-        self._write(int(asked["move"]), int(asked["period"]))
+        """Have this process's latest request, if there is one, in force for another lease."""
+        if self._has_asked:
+            self._write(int(self._asked["move"]), int(self._asked["period"]))
 
     def close(self) -> None:
-        """Let the loop go back to its own instants."""
-        if self._number and int(self._asked["tid"]) == self._inner_tid:
+        """Let the loop go back to its own instants, if it was moved."""
+        if self._has_asked and int(self._asked["tid"]) == self._inner_tid:
             self._write(int(self._asked["move"]), int(self._asked["period"]), until_ns=1)
 
     def _write(self, move_ns: int, period_ns: int, until_ns: int | None = None) -> None:
