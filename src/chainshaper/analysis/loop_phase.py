@@ -12,10 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 FEWEST = 16  # starts from which a phase is known
+FEWEST_FOR_DRIFT = 32  # with fewer, lateness would pass for a drift: there is taken to be none
 MOST = 1024  # starts that are remembered
 LONGEST_NS = 20_000_000_000  # of the starts that are remembered, the first is no older
 RESTARTED = 8  # so many starts in turn elsewhere: the loop was started again, or has been moved
-_LARGEST_DRIFT = 1e-3  # of a period: a loop that deviates by more has another one
+# Of a period: a loop that deviates by more has another one; of few starts, some of them late, more.
+_LARGEST_DRIFT, _LARGEST_OF_FEW = 1e-3, 0.02
 
 
 @dataclass(frozen=True)
@@ -66,8 +68,10 @@ def phase_of(starts_ns: Sequence[int] | npt.NDArray[np.int64], period_ns: int) -
     half = since.size // 2
     apart = turns[half : 2 * half] - turns[:half]
     measured = float(np.median((since[half : 2 * half] - since[:half]) / apart))
-    if abs(measured / period_ns - 1) > _LARGEST_DRIFT:
+    is_few = since.size < FEWEST_FOR_DRIFT
+    if abs(measured / period_ns - 1) > (_LARGEST_OF_FEW if is_few else _LARGEST_DRIFT):
         return None
+    measured = float(period_ns) if is_few else measured
     off = since - turns * measured
     usual = float(np.median(off))
     low, high = np.percentile(off, (0.5, 99.5))

@@ -39,6 +39,7 @@ from chainshaper.robot.clocks import clock_offset
 from chainshaper.values import events
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.event_declarations import LOOP_MOVES
 from chainshaper.values.progress import Progress
 from chainshaper.values.recording import (
     InForceInfo,
@@ -136,6 +137,9 @@ def run_application(
     tables = event_tables(run.logs, run.timing.record_from_ns)
     tables |= meter_tables(run.stalls.seen, tables.get("machine_stall"))
     tables |= run.tables
+    if "thread_sleep" in tables:
+        moved = events.table(tables, "loop_moved")
+        tables["thread_sleep"] = with_moved_sleeps(tables["thread_sleep"], moved)
     notes = list(_notes(realtime, permitted, run.memory_locked, run.clock_moved_ns))
     if run.was_interrupted:
         tables = dict(events.happened(tables, 0, run.timing.stop_ns))
@@ -233,6 +237,39 @@ def _run(
         clock_moved_ns=clock_offset() - offset_ns,
         tables={} if tables_of is None else tables_of(),
     )
+
+
+def with_moved_sleeps(sleeps: pl.DataFrame, moved: pl.DataFrame) -> pl.DataFrame:
+    """Return the table `thread_sleep` of loops that log their own instants, as they were moved.
+
+    ``moved`` is the table `loop_moved`: the library notes each change right behind the beginning of
+    the sleep that it is for, which the loop has logged before. ``until`` gets what was added.
+    """
+    if moved.is_empty():
+        return sleeps
+    one_off = [LOOP_MOVES.index("asked"), LOOP_MOVES.index("followed")]
+    changes = moved.select(
+        *("pid", "tid", "kept"),
+        changed=pl.col("time"),
+        once=pl.when(pl.col("why").is_in(one_off)).then("added").otherwise(0),
+    ).sort("changed")
+    rows = sleeps.with_row_index("row").sort("time")
+    begun = rows.select("pid", "tid", "time", "row")
+    changes = changes.join_asof(
+        begun, left_on="changed", right_on="time", by=["pid", "tid"], check_sortedness=False
+    )
+    changes = changes.drop_nulls("row").select("pid", "tid", "kept", "once", since="time", at="row")
+    rows = rows.join_asof(
+        changes.sort("since"),
+        left_on="time",
+        right_on="since",
+        by=["pid", "tid"],
+        check_sortedness=False,
+    )
+    is_first = pl.col("row") == pl.col("at")
+    added = pl.col("kept").fill_null(0) + pl.when(is_first).then("once").otherwise(0)
+    rows = rows.with_columns(until=pl.col("until") + added)
+    return rows.sort("row").select(sleeps.columns)
 
 
 def _plan_of_others(
