@@ -101,8 +101,8 @@ def test_the_loop_is_moved_behind_the_output(tmp_path: Path) -> None:
     assert abs(usual_lead(recording) - LEAD) < LOOP / 5
     # Its rate is the same: it has started once in each period, but where it was moved.
     (pid,) = (pid for pid, name in recording.info.processes.items() if name == "/controller")
-    wakes = recording.events["thread_wake"].filter(pid=pid)["time"]
-    turns = np.rint(np.diff(wakes.to_numpy()) / LOOP)
+    wakes = recording.events["thread_wake"].filter(pid=pid)["time"].to_numpy()
+    turns = np.rint(np.diff(wakes) / LOOP)
     assert np.mean(turns == 1) > 0.9
 
 

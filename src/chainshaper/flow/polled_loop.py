@@ -1,6 +1,9 @@
 """A loop that no library sees: its wake-ups are counted from outside, and it is not moved."""
 
+import time
 from dataclasses import dataclass
+
+import numpy as np
 
 from chainshaper.flow.phase import watch_wake_ups
 from chainshaper.linux.threads import find_thread
@@ -8,6 +11,7 @@ from chainshaper.sources.preload.moving import LoopMoved
 from chainshaper.values.errors import OperationError
 
 _TURNS = 24  # of the loop, in one look
+_REST_NS = 2_000_000_000  # from one look to the next
 
 
 @dataclass
@@ -17,6 +21,7 @@ class PolledLoop:
     pid: int
     tid: int
     period_ns: int
+    _since_ns: int = 0  # from when on to look again
 
     @property
     def is_there(self) -> bool:
@@ -24,12 +29,19 @@ class PolledLoop:
         return thread is not None and thread.pid == self.pid
 
     def seen(self) -> tuple[list[int], list[LoopMoved]]:
-        """Watch for some of its turns, and return when it woke up (ns)."""
+        """Watch for some of its turns, and return when it woke up behind a rest (ns).
+
+        Where it waits for a lock within a turn, it wakes up several times. Between two looks it is
+        left alone for a while: none is returned then.
+        """
+        if time.monotonic_ns() < self._since_ns:
+            return [], []
         try:
             wake_ups = watch_wake_ups(self.pid, [self.tid], _TURNS * self.period_ns)
         except OperationError:  # it has ended meanwhile
             return [], []
-        return wake_ups.tolist(), []
+        self._since_ns = time.monotonic_ns() + _REST_NS
+        return wake_ups[1:][np.diff(wake_ups) > self.period_ns / 2].tolist(), []
 
     def move(self, move_ns: int, period_ns: int) -> int:
         """Raise OperationError: it cannot be moved."""
