@@ -226,6 +226,7 @@ IRREGULAR = replace(LOOP, period_ns=None, intervals_ns=(5 * MS, 10 * MS, 40 * MS
 WRONG = [
     (IRREGULAR, {}, InputError, r"sleeps irregularly: 10 ms .* from 5 ms \(p5\) to 40 ms"),
     (replace(LOOP, period_ns=15 * MS), {}, InputError, "are 5 ms apart, over 10 ms"),
+    (replace(LOOP, inferred=True), {}, InputError, "no events of the sleeps of"),
     (LOOP, {"bands": 2}, InputError, "one band"),
     (LOOP, {"policy": "let-per-chain"}, InputError, "of the policy shaped"),
     (LOOP, {"publication": "asynchronous"}, InputError, "not a publisher's thread"),
@@ -277,6 +278,8 @@ def test_irregular_and_drifting_loops_have_ages_at_any_phase() -> None:
     assert loop.moved_ns == 0, "the phase comes round"
     assert loop.age == loop.age_at_any_phase
     assert any("180.0 ms in an hour" in line for line in plan_warnings(plan))
+    plan, _ = planned(replace(LOOP, inferred=True))
+    assert any("it reads its data sooner" in line for line in plan_warnings(plan))
     _, loop = planned(replace(LOOP, drift_ppm=50.0), in_step=True)
     assert loop.age.constant
 

@@ -279,6 +279,8 @@ class PlannedLoop(Part):
     # How much faster than the chain's clock the loop's runs, in millionths; its phase moves so.
     drift_ppm: Annotated[float, Field(allow_inf_nan=False)] = 0.0
     samples: FromOne  # instances that were measured
+    # Its starts are those of its publications, since the recording has no events of its sleeps.
+    inferred: Literal[True] | None = None
     # From the output's publication to the loop's store: shortest, longest of 99.5 %, longest.
     delivery_ns: tuple[Duration, Duration, Duration]
     # So long before an instance the output leaves, in step, at least: delivery and margin.

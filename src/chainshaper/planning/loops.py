@@ -78,6 +78,7 @@ def with_loop(plan: ChainPlan, profile: Profile, wishes: Wishes) -> ChainPlan:
     planned = _planned(plan, loop, wishes)
     if in_step is not None:
         _refuse_step(plan, loop, planned, in_step)
+        _refuse_timing(plan, loop, planned, in_step)
         return stated(_in_step(plan, planned, in_step, loop.before_ns))
     plan = plan.model_copy(update={"loop": planned})
     if plan.policy == "shaped" and planned.period_ns is not None and not planned.drift_ppm:
@@ -221,6 +222,7 @@ def _planned(plan: ChainPlan, loop: RecordedLoop, wishes: Wishes) -> PlannedLoop
         jitter_ns=loop.jitter_ns,
         drift_ppm=loop.drift_ppm,
         samples=loop.samples,
+        inferred=True if loop.inferred else None,
         delivery_ns=delivery,
         lead_ns=lead_ns,
         realtime_priority=loop.realtime_priority,
@@ -350,6 +352,11 @@ def _refuse_step(
             f"{option}: {named} sleeps irregularly: {usual} lie between its starts, from {low} (p5)"
             f" to {high} (p95). Nothing is in step with it: leave this out"
         )
+    if recorded.inferred:
+        raise InputError(
+            f"{option}: the recording has no events of the sleeps of {named}, so that when it"
+            " starts to compute is not known: record with --source preload, or leave this out"
+        )
     cycle, period = plan.cycle_ns, loop.period_ns
     if cycle % period and period % cycle:
         common = math.gcd(cycle, period)
@@ -366,6 +373,17 @@ def _refuse_step(
     if plan.shaping_node is None:
         reason = "a shaping node's slot is put in step, not a publisher's thread"
         raise InputError(f"{option}: {reason}: plan with --publication synchronous, or in-process")
+
+
+def _refuse_timing(
+    plan: ChainPlan, recorded: RecordedLoop, loop: PlannedLoop, in_step: InStep
+) -> None:
+    """Refuse times of which no slot, or none in this cycle, is in step with a loop of a period.
+
+    Raises InputError: they vary too much. OperationError: the cycle is too short.
+    """
+    option, named = _option(in_step), f"the loop of {loop.node}"
+    cycle, period = plan.cycle_ns, loop.period_ns or plan.cycle_ns
     stored, common = loop.lead_ns - loop.stored_ns[0], math.gcd(cycle, period)
     if stored + loop.jitter_ns > common:
         why = " (its own thread takes them)" if recorded.takes_itself else ""

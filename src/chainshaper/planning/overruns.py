@@ -503,6 +503,9 @@ def _about_loop(plan: ChainPlan) -> Iterator[str]:
         text = f"{named} sleeps irregularly: {usual} lie between its starts, from {low} (p5) to"
         yield f"{text} {high} (p95). Nothing is planned in step with it."
         return
+    if loop.inferred:
+        text = f"the recording has no events of the sleeps of {named}: its ages are those at its"
+        yield f"{text} publications, and it reads its data sooner. Record with --source preload."
     cycle, period = plan.cycle_ns, loop.period_ns
     common = plans.loop_common_ns(plan)
     can_be_constant = common == min(cycle, period)

@@ -88,6 +88,8 @@ class RecordedLoop:
     * ``core``: where its thread has to run; None: several, or not known.
     * ``time_ns``, ``once_ns``: how long its instances take in a cycle of the chain, and how long
       one takes, at most.
+    * ``inferred``: whether no event tells of its sleeps, so that each of its instances starts with
+      its publication.
     * ``before_ns``: so much sooner, in step, the output has to leave, since outputs of other chains
       leave then for the same loop.
     """
@@ -109,6 +111,7 @@ class RecordedLoop:
     realtime_priority: int | None = None
     time_ns: int = 0
     once_ns: int = 0
+    inferred: bool = False
     before_ns: int = 0
 
 

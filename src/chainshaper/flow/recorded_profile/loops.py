@@ -107,6 +107,7 @@ def recorded_loop(
         thread=None if thread is None else thread.comm or None,
         core=thread.cores[0] if thread is not None and len(thread.cores) == 1 else None,
         realtime_priority=thread.priority if thread and realtime and not raised_by_us else None,
+        inferred=instances.join(flow.turns, on="instance", how="semi").is_empty(),
         time_ns=int(in_cycles["together"].max()),  # type: ignore[arg-type]
         once_ns=int(in_cycles["longest"].max()),  # type: ignore[arg-type]
         **measured,  # type: ignore[arg-type]
