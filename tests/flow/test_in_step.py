@@ -62,6 +62,7 @@ class World:
     asked: list[int] = field(default_factory=list)
     moves: list[LoopMoved] = field(default_factory=list)
     given_back: int = 0
+    turn_ns: int = 0  # is not seen
     alive: bool = True
     draw: random.Random = field(default_factory=lambda: random.Random(1))
     tid: int = 7

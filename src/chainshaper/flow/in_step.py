@@ -43,6 +43,7 @@ TOLERANCE_NS = 30_000  # nothing is moved for less
 LOOK_S = 0.1
 STEPS = 50  # so many of the latest moves are shown
 _ORIGINS_NS = 20_000_000_000  # of the chain's origins, none is older
+_RESERVE = 0.05  # of a loop's period: so much more time than for its work is left to it
 _SEARCH_EVERY = 10  # looks from one search for the loop to the next
 
 
@@ -51,6 +52,8 @@ class LoopStarts(Protocol):
 
     tid: int
 
+    @property
+    def turn_ns(self) -> int: ...
     @property
     def is_there(self) -> bool: ...
     def seen(self) -> tuple[list[int], list[LoopMoved]]: ...
@@ -160,6 +163,7 @@ class InStep:
         self._loops, self._own, self._restarts = PhaseTrack(self.period_ns), OwnStarts(), 0
         self._moved_ns: int | None = None  # of what is moved; None: it was not, since it started
         self._elsewhere = False  # one of the two starts elsewhere since the latest move
+        self._follows = False  # the loop's next instant follows from its last sleep
         self._late_ns = 0  # the loop cannot be where it is to be, and starts so much later
         self._unreachable_ns = self.period_ns  # from here on a move changes the loop's rate
         self._looks = 0
@@ -256,6 +260,7 @@ class InStep:
             self._mover = self._find()
             self._loops, self._own = PhaseTrack(self.period_ns), OwnStarts()
             self._moved_ns = self._moved_ns if self.loop.in_step == "output" else None
+            self._follows = False
             self._restarts, self._late_ns, self._unreachable_ns = 0, 0, self.period_ns
             if self._mover is None:
                 return
@@ -268,6 +273,7 @@ class InStep:
             self._note(None, "the loop starts elsewhere now: its phase is measured anew")
         if self.loop.in_step == "loop":
             self._mover.renew()
+        self._follows |= any(move.why == "followed" for move in moves)
         for move in moves:
             if move.why == "rate changed":
                 self._unreachable_ns = min(self._unreachable_ns, move.asked_ns)
@@ -281,7 +287,11 @@ class InStep:
     def _move_loop(self, mover: LoopStarts, loop: LoopPhase, origin: LoopPhase) -> None:
         output = origin.at_ns + self._slot_ns + self.loop.lead_ns
         period_ns = round(loop.period_ns)
-        range_ns = (0, min(period_ns, self._unreachable_ns) - 1)
+        # A loop with instants of its own gets twice what its turns last, and some more, for its work.
+        reserve_ns = 2 * mover.turn_ns + round(_RESERVE * period_ns)
+        if self._follows or not mover.turn_ns:
+            reserve_ns = 0
+        range_ns = (0, max(0, min(period_ns - reserve_ns, self._unreachable_ns) - 1))
         before = self._moved_ns
         # The loop's place is that of its own starts; a small step follows a drift, a large one not.
         wanted = output - loop.near(output)

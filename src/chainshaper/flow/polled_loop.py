@@ -21,6 +21,7 @@ class PolledLoop:
     pid: int
     tid: int
     period_ns: int
+    turn_ns: int = 0  # how long its turns last is not seen
     _since_ns: int = 0  # from when on to look again
 
     @property

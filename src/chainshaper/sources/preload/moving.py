@@ -16,6 +16,7 @@ for work.
 
 import mmap
 import time
+from collections import deque
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
@@ -36,6 +37,7 @@ from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.event_declarations import LOOP_MOVES
 
 _CHECK = 0x6D6F76656C6F6F70  # `CHECK` in preload.c
+_TURNS = 1024  # of a loop, whose durations are remembered
 _SHORTEST_NS, _LONGEST_NS = 10_000, 10_000_000_000  # periods that preload.c takes
 
 
@@ -88,6 +90,8 @@ class LoopMover:
         self._asked: Any = heads["asked"][self.ring]
         self._number = int(self._asked["number"])
         self._has_asked = False
+        self._turns_ns = deque[int](maxlen=_TURNS)  # how long the latest ones lasted
+        self._woke_ns: int | None = None  # when a turn began that has not ended yet
 
     def __enter__(self) -> "LoopMover":
         return self
@@ -115,17 +119,30 @@ class LoopMover:
 
         The first call returns what the memory still has from before.
         """
-        names = event_names()
-        wake, moved = (FIRST_EVENT + names.index(name) for name in ("thread_wake", "loop_moved"))
+        names, wanted = event_names(), ("thread_wake", "thread_sleep", "loop_moved")
+        wake, sleep, moved = (FIRST_EVENT + names.index(name) for name in wanted)
         starts, moves = list[int](), list[LoopMoved]()
         for records in self.process.new_records(self.ring):
             is_wake = (records["event"] == wake) & (records["values"][:, 0] != 0)
             starts += records["time"][is_wake].tolist()
+            is_turn = is_wake | (records["event"] == sleep)
+            for number, at in records[is_turn][["event", "time"]].tolist():
+                if number == sleep and self._woke_ns is not None:
+                    self._turns_ns.append(at - self._woke_ns)
+                self._woke_ns = at if number == wake else None
             for record in records[records["event"] == moved]:
                 number, asked, added, kept, why = record["values"][:5].astype("<i8").tolist()
                 reason = LOOP_MOVES[why] if why < len(LOOP_MOVES) else ""
                 moves.append(LoopMoved(int(record["time"]), number, asked, added, kept, reason))
         return starts, moves
+
+    @property
+    def turn_ns(self) -> int:
+        """How long the loop's turns last, from waking up to the next sleep (ns): 99.5 % of them.
+
+        0: none was seen yet.
+        """
+        return int(np.percentile(self._turns_ns, 99.5)) if self._turns_ns else 0
 
     def move(self, move_ns: int, period_ns: int) -> int:
         """Have the loop wake up ``move_ns`` later than it would by itself; return the number.
