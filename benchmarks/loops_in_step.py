@@ -66,7 +66,7 @@ def main() -> None:
     parser.add_argument("--drift", type=float, default=50.0, metavar="PPM")
     parser.add_argument("--loops", type=int, nargs="+", default=[10, 1], metavar="MS")
     parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows of the table")
-    parser.add_argument("--phase", type=int, default=4300, metavar="US", help="of the loop")
+    parser.add_argument("--phase", type=int, default=8000, metavar="US", help="of the loop")
     parser.add_argument("--output", type=Path, help="where the recordings stay")
     chosen = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:

@@ -287,7 +287,7 @@ class InStep:
     def _move_loop(self, mover: LoopStarts, loop: LoopPhase, origin: LoopPhase) -> None:
         output = origin.at_ns + self._slot_ns + self.loop.lead_ns
         period_ns = round(loop.period_ns)
-        # A loop with instants of its own gets twice what its turns last, and some more, for its work.
+        # A loop with instants of its own gets twice what its turns last, and more, for its work.
         reserve_ns = 2 * mover.turn_ns + round(_RESERVE * period_ns)
         if self._follows or not mover.turn_ns:
             reserve_ns = 0
