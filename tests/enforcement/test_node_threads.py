@@ -38,7 +38,14 @@ from chainshaper.linux.processes import RunningProcess, read_process
 from chainshaper.linux.scheduling import SchedulingRequest
 from chainshaper.linux.threads import RunningThread, ThreadRole, gate_thread_name, role_of
 from chainshaper.planning import plan_shaping
-from chainshaper.planning.chain_plan import ReceiverPlace, Server, ShapingNode, revised
+from chainshaper.planning.chain_plan import (
+    LoopAge,
+    PlannedLoop,
+    ReceiverPlace,
+    Server,
+    ShapingNode,
+    revised,
+)
 from chainshaper.planning.chain_plan import Thread as PlannedThread
 from chainshaper.planning.plan import Plan
 from chainshaper.planning.shaping import let_per_chain, over_cores
@@ -440,6 +447,42 @@ def test_receivers_with_a_place_stand_above_the_chain_and_behind_its_gates() -> 
         assert not waiting_receivers(plan, wanted)
     missing = plan_scheduling(plan, allocation, (0, 1))
     assert _by_tid(missing)[300] == SchedulingRequest(86, (1,)), "there is no core 2"
+
+
+def test_the_thread_of_a_loop_that_reads_the_output_is_raised_unless_it_raised_itself() -> None:
+    """It stands where receivers with a place do, on the core that the plan has for it."""
+    place = ReceiverPlace(core=2, priority=1, time_ns=MS)
+    loop = PlannedLoop(
+        node="/sink",
+        thread="control_loop",
+        topic="/out",
+        period_ns=10 * MS,
+        samples=1,
+        delivery_ns=(0, 0, 0),
+        lead_ns=0,
+        runs_at=place,
+        age=LoopAge(first_ns=(0, 0), every_ns=(0, 0), constant=True, uses=(1, 1)),
+    )
+    chain = _server("chain", EXECUTOR_A, priority=2)
+    bare = _plan(chain, _server("output", GATE.thread, priority=1, start=1)).chains[0]
+    gate, first = _node("/gate", 100, "executor"), _node("/a", 200, "executor")
+    main, other = _node("/sink", 300, "executor", "unknown")
+    for named, priority, seen in (
+        ("control_loop", 0, "301:86@2"),
+        ("control_loop", 86, "301:86@2"),  # as we have raised it
+        ("control_loop", 50, ""),  # it has raised itself
+        ("helper", 0, ""),
+    ):
+        thread = replace(other.thread, comm=named, priority=priority)
+        allocation = _allocation(gate, first, [main, replace(other, thread=thread)])
+        plan = Plan.of(revised(bare, shaping_node=GATE, loop=loop))
+        wanted = _text(plan_scheduling(plan, allocation, (0, 1, 2)))
+        assert wanted.strip() == f"100:87@1 200:84@1 {seen}".strip()
+    by_itself = Plan.of(
+        revised(bare, shaping_node=GATE, loop=loop.model_copy(update={"runs_at": None}))
+    )
+    allocation = _allocation(gate, first, [main, replace(other, thread=thread)])
+    assert 301 not in _by_tid(plan_scheduling(by_itself, allocation, (0, 1, 2)))
 
 
 def test_a_gate_inside_the_chain_stands_behind_that_of_its_output() -> None:

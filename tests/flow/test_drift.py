@@ -27,6 +27,7 @@ from chainshaper.flow.plan_in_force import origins, supervision
 from chainshaper.flow.plan_in_force import threads as run_threads
 from chainshaper.flow.plan_in_force.anchor import AnchoredPlan
 from chainshaper.flow.plan_in_force.followers import Followers
+from chainshaper.flow.plan_in_force.loops import LoopsInStep
 from chainshaper.flow.plan_in_force.origins import OriginWatches, follow_timer
 from chainshaper.flow.plan_in_force.phases import PhaseMessages
 from chainshaper.flow.plan_in_force.supervision import Supervision
@@ -128,6 +129,7 @@ def run_of(
         report=apply._begin_report(here, Choice(back_end, ""), joint, (), ""),
         phases=PhaseMessages(),
         followers=Followers(anchored, here),
+        loops=LoopsInStep(),
         origins=OriginWatches(),
         servers=here,
         stop=stop,

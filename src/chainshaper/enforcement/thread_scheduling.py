@@ -17,6 +17,8 @@ SCHED_FIFO priorities (DESIGN section 6). From the most urgent:
   behind the shaping nodes and above everything else there. Otherwise they are below all servers, on
   the shaping node's core or, in a plan of several chains, whose servers keep that core busy, on the
   first core without servers;
+* the thread of a loop that reads an output, at the place that the plan has for it, unless it has a
+  real-time priority by itself;
 * an asynchronous publisher, below every other thread of its process on its core: it spins on the
   writer's lock, and above them would never let them release it;
 * the thread by which Fast DDS sends what synchronous writers could not (`dds.asyn.N.0`), under the
@@ -36,7 +38,7 @@ from chainshaper.enforcement.planned_threads import place_of, server_members
 from chainshaper.enforcement.servers import ReservationServer
 from chainshaper.linux.scheduling import SchedulingRequest
 from chainshaper.linux.threads import is_of_zenoh
-from chainshaper.planning.chain_plan import ReceiverPlace, Server, Thread
+from chainshaper.planning.chain_plan import PlannedLoop, ReceiverPlace, Server, Thread
 from chainshaper.planning.plan import Plan
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.middleware import ROUTERS
@@ -44,6 +46,7 @@ from chainshaper.values.middleware import ROUTERS
 DDS_PRIORITY = 90
 _BEST_SERVER_PRIORITY = 87
 _BELOW = 1  # room for a publisher below a server's threads
+_LOOPS = "a loop that reads the output, in its place"
 _RECEIVES, _RECEIVES_IN_PLACE = "receives the output", "receives the output, in its place"
 
 
@@ -103,7 +106,17 @@ def plan_scheduling(
         places=plan.receivers_at,
         take_turns=plan.takes_turns,
         clear={node.core for node in plan.shaping_nodes},
+        loops=planned_loops(plan),
     )
+
+
+def planned_loops(plan: Plan) -> list[tuple[PlannedLoop, ReceiverPlace]]:
+    """Return the loops that read outputs and have a place in the plan, with this place."""
+    return [
+        (chain.loop, chain.loop.runs_at)
+        for chain in plan.chains
+        if chain.loop is not None and chain.loop.runs_at is not None
+    ]
 
 
 def waiting_receivers(plan: Plan, wanted: Iterable[WantedScheduling]) -> list[str]:
@@ -136,6 +149,7 @@ def scheduling_around(
     places: Mapping[str, ReceiverPlace] = MappingProxyType({}),
     take_turns: bool = False,
     clear: Collection[int] = (),
+    loops: Sequence[tuple[PlannedLoop, ReceiverPlace]] = (),
 ) -> tuple[WantedScheduling, ...]:
     """Return what the threads of servers, and the other threads of their processes, get.
 
@@ -149,6 +163,8 @@ def scheduling_around(
       other callbacks.
     * ``places``: for some receivers, another priority and, if it is available, another core.
     * ``take_turns``: whether servers of one priority share it by turns (SCHED_RR).
+    * ``loops``: loops that read an output, each with the place of its thread. A thread that has
+      raised itself stays as it is.
     * ``clear``: the cores that DDS threads leave where all cores have servers; otherwise they leave
       all cores with servers.
 
@@ -159,7 +175,8 @@ def scheduling_around(
         name: sorted({place_of(listed, order) for listed in group})
         for name, group in members.items()
     }
-    priorities = server_priorities(_sizes(servers, places_taken, behind, places))
+    of_loops = {loop.node: place for loop, place in loops}
+    priorities = server_priorities(_sizes(servers, places_taken, behind, {**of_loops, **places}))
     in_servers = [
         WantedScheduling(
             listed,
@@ -186,6 +203,7 @@ def scheduling_around(
         available_cores=available_cores,
         busy=busy,
     )
+    receiving += _looping(allocation, planned, loops, priorities, available_cores)
     planned |= {item.node_thread.thread.identity for item in receiving}
     free_cores = tuple(sorted(set(available_cores) - busy))
     if not free_cores and clear:
@@ -272,6 +290,36 @@ def _receiving(
             request = SchedulingRequest(priority, (core,))
             receiving.append(WantedScheduling(listed, request, None, reason))
     return receiving, pids
+
+
+def _looping(
+    allocation: Allocation,
+    planned: Collection[tuple[int, int]],
+    loops: Sequence[tuple[PlannedLoop, ReceiverPlace]],
+    priorities: Mapping[int, Sequence[int]],
+    available_cores: Collection[int],
+) -> list[WantedScheduling]:
+    """Return what the threads of loops get that read an output, unless they have raised themselves.
+
+    A loop's thread is known by its name. ``planned``: the identities of threads that have their
+    place already.
+    """
+    looping = list[WantedScheduling]()
+    for loop, place in loops:
+        if place.priority not in priorities or loop.thread is None:
+            continue
+        priority = priorities[place.priority][-1]
+        for listed in allocation.threads:
+            thread = listed.thread
+            is_meant = loop.node in listed.nodes and thread.comm == loop.thread
+            has_raised_itself = thread.priority not in (0, priority)
+            if not is_meant or has_raised_itself or thread.identity in planned:
+                continue
+            cores = (place.core,) if place.core in available_cores else None
+            looping.append(
+                WantedScheduling(listed, SchedulingRequest(priority, cores), None, _LOOPS)
+            )
+    return looping
 
 
 def _routers_of(pids: Collection[int], allocation: Allocation) -> set[int]:

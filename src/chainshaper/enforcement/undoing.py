@@ -86,6 +86,25 @@ class SlotMove:
 
 
 @dataclass(frozen=True)
+class LoopStep:
+    """A move of a chain's output, or of a loop, so that both are in step."""
+
+    at_ns: int  # when it was asked for (CLOCK_MONOTONIC)
+    chain: str
+    loop: str  # its node
+    moves: str  # what is moved: "output" or "loop"
+    moved_ns: int | None  # how much later than by itself that comes now; None: nothing was moved
+    drift_ppm: float | None  # of the loop's clock against that of this machine
+    why: str
+
+    @property
+    def text(self) -> str:
+        moved = "stays" if self.moved_ns is None else f"comes {duration_text(self.moved_ns)} later"
+        subject = f"the loop of {self.loop}" if self.moves == "loop" else f"output of {self.chain}"
+        return f"in step: {subject} {moved}: {self.why}"
+
+
+@dataclass(frozen=True)
 class RunState:
     """The state of a run, as `run.json` shows it.
 
@@ -109,6 +128,7 @@ class RunState:
     in_force_ns: int | None = None  # when the first whole cycle that was enforced began
     ended_ns: int | None = None
     moves: tuple[SlotMove, ...] = ()  # the latest ones of each chain's gate
+    steps: tuple[LoopStep, ...] = ()  # the latest ones of each loop that is kept in step
 
 
 def save_run_state(folder: Path, state: RunState) -> None:

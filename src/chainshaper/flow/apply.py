@@ -28,6 +28,7 @@ from chainshaper.enforcement.servers import BackEnd
 from chainshaper.enforcement.thread_scheduling import waiting_receivers
 from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow.followed_chains import followed_chains
+from chainshaper.flow.in_step import loops_in_step
 from chainshaper.flow.plan_checks import (
     check_publishers,
     refuse_other_clocks,
@@ -36,6 +37,7 @@ from chainshaper.flow.plan_checks import (
 )
 from chainshaper.flow.plan_in_force.anchor import AnchoredPlan
 from chainshaper.flow.plan_in_force.followers import Followers
+from chainshaper.flow.plan_in_force.loops import LoopsInStep
 from chainshaper.flow.plan_in_force.origins import OriginWatches
 from chainshaper.flow.plan_in_force.phases import PhaseMessages
 from chainshaper.flow.plan_in_force.report import RunReport
@@ -99,7 +101,8 @@ def apply_plan(
     application runs already. Its nodes have ``wait_ns`` to appear (default: 30 s with a command,
     else none). ``phase_ns`` is where in a cycle the first chain's timer expires, on CLOCK_MONOTONIC
     (None: those of all chains are measured). With ``adapt`` slots follow the latencies, to no later
-    end than ``max_latency_ns`` (None: as the plan says). ``recording`` is one of the very
+    end than ``max_latency_ns`` (None: as the plan says). Where the plan has a loop in step, the
+    output's slots, or the loop, are moved so that they are. ``recording`` is one of the very
     processes, or of an earlier run (None: those that the plan names); ``users`` are as for
     :func:`.find_threads`. ``watch`` gets the state every second; ``folder`` is where runs stand
     (default: `/run/chainshaper`).
@@ -114,9 +117,7 @@ def apply_plan(
     check_cores({server.core: f"server {server.name}" for server in plan.servers})
     choice = choose_back_end(back_end)
     refuse_unfit(plan, choice.name)
-    reaches_ns, why_not = dict[int, tuple[int, int]](), list[str]()
-    if adapt:
-        plan, reaches_ns, why_not = followed_chains(plan, choice.name, max_latency_ns)
+    plan, reaches_ns, why_not = _followed(plan, choice.name, max_latency_ns, adapt=adapt)
     # Looked up once: that takes longer than looking at processes.
     recordings, unread = evidence_of(plan, recording)
     recorded, unread = recorded_in(recordings, unread)
@@ -161,6 +162,7 @@ def apply_plan(
             report=report,
             phases=run.phases,
             followers=followers,
+            loops=run.loops,
             origins=run.origins,
             servers=servers,
             stop=stop,
@@ -171,6 +173,7 @@ def apply_plan(
         _arm(supervision, progress)
         report.note(*why_not)
         followers.start(run_threads.latest, reaches_ns)
+        run.loops.start(anchored, run_threads.latest)
         supervision.watch_over(watch)
         strangers = look_alikes(journal, groups_of(run_of(journal)))
     finally:
@@ -182,6 +185,17 @@ def apply_plan(
     return Applied(report.state, run.command.returncode if run.command else None)
 
 
+def _followed(
+    plan: Plan, back_end: str, max_latency_ns: int | None, *, adapt: bool
+) -> tuple[Plan, dict[int, tuple[int, int]], list[str]]:
+    """Find which chains' slots follow their latencies: none without ``adapt``.
+
+    Returns as :func:`.followed_chains`. Raises InputError: no slot can, or one is in step.
+    """
+    loops_in_step(plan, adapt)
+    return followed_chains(plan, back_end, max_latency_ns) if adapt else (plan, {}, [])
+
+
 @dataclass
 class _Run:
     """What a run has begun, and is to be ended while a plan is put out of force."""
@@ -191,6 +205,7 @@ class _Run:
     command: subprocess.Popen[bytes] | None = None
     servers: BackEnd | None = None
     followers: Followers | None = None
+    loops: LoopsInStep = field(default_factory=LoopsInStep)
     phases: PhaseMessages = field(default_factory=PhaseMessages)
     origins: OriginWatches = field(default_factory=OriginWatches)
 
@@ -198,6 +213,7 @@ class _Run:
         """Put everything back: first let all threads go, then end our command, then the rest."""
         problems: list[str] = []
         self.origins.end()
+        self.loops.end()
         if self.followers is not None:
             self.followers.end()
         if self.servers is not None:

@@ -6,26 +6,34 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 
+import polars as pl
+
 from chainshaper.enforcement.back_ends import choose_back_end, make_back_end
 from chainshaper.enforcement.guardian import run_claimed
 from chainshaper.flow.drift import SlotFollower
 from chainshaper.flow.followed_chains import followed_chains
+from chainshaper.flow.in_step import InStep, find_loop, loops_in_step, with_loops_as_they_are
 from chainshaper.flow.server_tables import table_of
 from chainshaper.planning import ChainPlan
 from chainshaper.planning.chain_plan import Server, Thread
 from chainshaper.planning.plan import Plan, open_until_done
 from chainshaper.planning.plan_file import plan_values
+from chainshaper.sources.preload import in_front, installed_library, named_loops
 from chainshaper.splicing.application import splice_application
 from chainshaper.splicing.shaped_outputs import remove_abandoned_pages
-from chainshaper.values.errors import OperationError
+from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.event_declarations import LOOP_MOVES
 from chainshaper.values.progress import Progress
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application
+from chainshaper.workload.launcher import LOOP_NAME
 from chainshaper.workload.live import (
     Enforcement,
     StartedNodes,
+    Tables,
     node_threads,
     run_application,
+    typed_table,
 )
 
 
@@ -46,24 +54,31 @@ def shape_application(
 
     ``enforcement`` puts the plan's servers in force while it runs; without, the
     :func:`gated_threads` are gated. With ``adapt`` slots follow the latencies, to no later end than
-    ``max_latency_ns`` (None: as the plan says).
+    ``max_latency_ns`` (None: as the plan says). Where the plan has a loop in step, output or loop
+    are moved so that they are: the loop's node runs with the tracing library in front for this.
 
     Raises InputError: the plan does not fit the application, or no slot can follow; PlatformError:
     threads cannot be frozen here; and as :func:`~chainshaper.workload.live.run_application`.
     """
     if enforcement is None and gated_threads(plan):
         enforcement = partial(threads_gated, plan)
+    loops_in_front = dict[str, str]()
+    if loops_in_step(plan, adapt):
+        enforcement = partial(loops_kept_in_step, plan, enforcement)
+        library = in_front(installed_library())
+        loops_in_front = {**library, named_loops.VARIABLE: named_loops.names_text([LOOP_NAME])}
     if adapt:
         plan, reaches_ns, _ = followed_chains(plan, "fifo", max_latency_ns)
         enforcement = partial(slots_followed, plan, reaches_ns, enforcement)
     try:
         return run_application(
-            splice_application(application, plan),
+            splice_application(application, with_loops_as_they_are(plan)),
             output,
             cycles=cycles,
             realtime=realtime,
             plan=plan_values(plan),
             enforcement=enforcement,
+            loops_in_front=loops_in_front,
             command=command,
             progress=progress,
         )
@@ -162,6 +177,59 @@ def slots_followed(
     for follower in followers:
         if follower.failure is not None:
             raise follower.failure
+
+
+@contextmanager
+def loops_kept_in_step(
+    plan: Plan, enforcement: Enforcement | None, nodes: StartedNodes
+) -> Iterator[Tables]:
+    """Keep outputs and loops in step, as a plan says, until the context ends.
+
+    Gives the events of how loops were moved. ``enforcement`` is entered as well, if there is one;
+    raises as that does.
+    """
+    anchor_ns = nodes.start_ns if plan.moves_timers else nodes.anchor_ns
+
+    def in_force_from(chain: ChainPlan, _: int) -> int:
+        """From the middle of the second cycle from now on, where no slot is (ns)."""
+        since = time.monotonic_ns() + 2 * chain.cycle_ns
+        return since + (anchor_ns + chain.offset_ns + chain.cycle_ns // 2 - since) % chain.cycle_ns
+
+    with ExitStack() as until:
+        if enforcement is not None:
+            until.enter_context(enforcement(nodes))
+        kept = list[InStep]()
+        for _, chain, loop in loops_in_step(plan):
+            if loop.node not in nodes.pids:
+                raise InputError(f"{loop.node}, the plan's loop, is no node of the application")
+            find = partial(find_loop, nodes.pids[loop.node], loop)
+            step = InStep(chain, nodes.pids.values(), find, partial(in_force_from, chain))
+            kept.append(step)
+            until.callback(step.end)
+        yield partial(_moves_of_loops, kept, nodes)
+    for step in kept:
+        if step.failure is not None:
+            raise step.failure
+
+
+def _moves_of_loops(kept: Sequence[InStep], nodes: StartedNodes) -> dict[str, pl.DataFrame]:
+    """Return the table of the event `loop_moved`; none where no loop was moved."""
+    rows = [
+        {
+            "time": move.at_ns,
+            "pid": nodes.pids[step.loop.node],
+            "tid": step.tid,
+            "cpu": None,
+            "request": move.number,
+            "asked": move.asked_ns,
+            "added": move.added_ns,
+            "kept": move.kept_ns,
+            "why": LOOP_MOVES.index(move.why) if move.why in LOOP_MOVES else len(LOOP_MOVES),
+        }
+        for step in kept
+        for move in step.loop_moves
+    ]
+    return {"loop_moved": typed_table("loop_moved", pl.DataFrame(rows))} if rows else {}
 
 
 def _threads_of(planned: Thread, nodes: StartedNodes) -> list[int]:

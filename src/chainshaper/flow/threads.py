@@ -38,7 +38,8 @@ def find_threads(
     """Find the threads of an application and what each of them does.
 
     ``where`` is a process, which stands for its descendants too; a plan, for the nodes of its
-    servers and its receivers; or None for all that looks like an application of ROS 2 or DDS.
+    servers, its receivers and its loops; or None for all that looks like an application of ROS 2 or
+    DDS.
     ``recording`` is one of the processes that still run, or of an earlier run (default: those that
     the plan names); a caller that looks often gives its processes, ``recorded``, instead. Only
     processes of ``users`` (names or numbers; default: the user who launched us, and root) are
@@ -91,10 +92,11 @@ def _family_of(pid: int, processes: Sequence[RunningProcess]) -> list[RunningPro
 
 
 def _planned_nodes(plan: Plan) -> tuple[set[str], set[str]]:
-    """Return the nodes of a plan's servers, and its receivers, which need not run."""
+    """Return the nodes of a plan's servers, and its receivers and loops, which need not run."""
     in_servers = {thread.node for server in plan.servers for thread in server.threads}
     receivers = {receiver for node in plan.shaping_nodes for receiver in node.receivers}
-    return in_servers, receivers
+    loops = {chain.loop.node for chain in plan.chains if chain.loop is not None}
+    return in_servers, receivers | loops
 
 
 def _is_wanted(process: RunningProcess, nodes: set[str], hosted: frozenset[str] | None) -> bool:

@@ -552,6 +552,8 @@ def servers_table(state: RunState) -> ResultTable:
             table.caption += f"; the chain's start has drifted by {state.drift_ns / 1e6:+.3f} ms"
         for move in {latest.chain: latest for latest in state.moves}.values():
             table.caption += f"; {move.text}"
+        for step in {(latest.chain, latest.loop): latest for latest in state.steps}.values():
+            table.caption += f"; {step.text}"
     for server in state.servers:
         slots = " ".join(map(slot_text, server.slots[:MOST_SLOTS]))
         # A server of several chains has slots over the whole hyper-period.

@@ -241,6 +241,7 @@ class FollowedOutput:
                 f"another run has the slots of {topic} follow its latencies: end that first"
             )
         self._seen = self._page["measured"]
+        self._decided = 0
         self.move(0, time.monotonic_ns())  # a run before may have moved them, and has ended
 
     def latencies(self) -> list[int]:
@@ -248,15 +249,33 @@ class FollowedOutput:
 
         Raises OperationError: the gate's page is not there any more.
         """
+        self._look()
+        new = self._page.latest("measured", self._seen)
+        self._seen = self._page["measured"]
+        return new
+
+    def origins(self, cycle_ns: int) -> list[int]:
+        """Return where the cycle of the latest message began (ns), unless the last call did.
+
+        The gate notes only the place in the cycle, which is what counts: where it notes it while
+        this looks, the origin may be that of the cycle before. Raises OperationError: as
+        :meth:`latencies`.
+        """
+        self._look()
+        published, page = self._page["measured"], self._page
+        if published == self._decided or not page["phase_known"]:
+            return []
+        self._decided = published
+        until = page["until_ns"]
+        return [until - (until - page["phase_ns"]) % cycle_ns]
+
+    def _look(self) -> None:
         try:
             self._page.look()
         except (OSError, ValueError) as error:
             raise OperationError(
                 f"{self._page.path}: its gate cannot be followed: {error}; start this run again"
             ) from error
-        new = self._page.latest("measured", self._seen)
-        self._seen = self._page["measured"]
-        return new
 
     def move(self, by_ns: int, from_ns: int) -> None:
         """Move slots by this time from where the gate has them, in cycles from an instant on."""

@@ -569,6 +569,15 @@ SLEEPING_CALLS = (
     "pthread_cond_wait",  # without a time: another thread paces it
 )
 
+# Why what is added to the sleeps of a loop has changed, by the numbers in `loop_moved`.
+LOOP_MOVES = (
+    "asked",  # added to one sleep, to see whether the loop's own instants move with it
+    "kept",  # they do not move: it is added to each sleep
+    "followed",  # they follow from when the sleep ended: it was added to one sleep
+    "rate changed",  # the loop left instances out: nothing is added any more
+    "over",  # the process that had it moved does not ask any more
+)
+
 _OURS = (
     # The user named a loop by its node, which was created in this process (`is_thread` 0), or by
     # the name of its thread, which is the event's `tid`.
@@ -597,6 +606,19 @@ _OURS = (
         (
             EventField("call", "count", 0),
             EventField("thread_time", "nanoseconds", presence="optional", record_place=2),
+        ),
+        recorded_by_library="arguments",
+    ),
+    # The sleeps of a loop were moved, as another process asked (`move_loop`).
+    Event(
+        "loop_moved",
+        "messages",
+        (
+            EventField("request", "count", 0),  # which one, from 1
+            EventField("asked", "nanoseconds", 1),  # how much later than by itself it shall wake up
+            EventField("added", "nanoseconds", 2),  # to this sleep, beside what was before
+            EventField("kept", "nanoseconds", 3),  # what is added to each sleep from this one on
+            EventField("why", "count", 4),  # place in LOOP_MOVES
         ),
         recorded_by_library="arguments",
     ),

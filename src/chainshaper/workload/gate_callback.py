@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 from chainshaper.robot.clear_core import ClearCore
 from chainshaper.robot.handover import Turn
@@ -25,7 +24,7 @@ def shaper_of(
         clear_until = ClearCore(delivery_core).clear_until
         shaper.on_waking = lambda release_ns: clear_until(release_ns + gate.pause_ns)
     if turn is not None:
-        shaper.follow = partial(turn.follow, shaper.queue)
+        turn.go_on(shaper)
     return shaper
 
 

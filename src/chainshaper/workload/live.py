@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -38,6 +39,7 @@ from chainshaper.robot.clocks import clock_offset
 from chainshaper.values import events
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.event_declarations import LOOP_MOVES
 from chainshaper.values.progress import Progress
 from chainshaper.values.recording import (
     InForceInfo,
@@ -76,8 +78,12 @@ class StartedNodes:
     start_ns: int  # the common start of all timers
 
 
-Enforcement: TypeAlias = Callable[[StartedNodes], AbstractContextManager[object]]
-"""Puts reservation servers in force for as long as its context lasts."""
+Tables: TypeAlias = Callable[[], Mapping[str, pl.DataFrame]]
+Enforcement: TypeAlias = Callable[[StartedNodes], AbstractContextManager[Tables | None]]
+"""Puts reservation servers in force for as long as its context lasts.
+
+It may give a function that returns event tables of its own once the context has ended.
+"""
 
 LEAD_NS = 300_000_000  # from when all nodes are ready to the start of their timers
 ENFORCING_NS = 2_000_000_000  # at most until servers are in force, before the first cycle
@@ -94,6 +100,7 @@ def run_application(
     realtime: bool | None = None,
     plan: dict[str, Any] | None = None,
     enforcement: Enforcement | None = None,
+    loops_in_front: Mapping[str, str] = MappingProxyType({}),
     command: Sequence[str] = (),
     progress: Progress = lambda *_: None,
 ) -> Recording:
@@ -103,7 +110,8 @@ def run_application(
     ``plan`` is stored with the recording. A few cycles before the recorded ones warm the caches and
     are left out. ``enforcement`` is entered when all nodes are ready and their threads have their
     scheduling. It is left when the run is over, however it ends, before any node is asked to leave:
-    a thread whose server is closed could not.
+    a thread whose server is closed could not. Nodes with a loop get the variables
+    ``loops_in_front``, which put the tracing library in front of them, so that it can be moved.
 
     Raises:
         InputError: ``output`` exists.
@@ -118,9 +126,20 @@ def run_application(
     check_cores(application.cores())
     permitted = fifo_permitted(realtime)
     realtime = permitted if realtime is None else realtime
-    run = _run(application, cycles, realtime=realtime, enforcement=enforcement, progress=progress)
+    run = _run(
+        application,
+        cycles,
+        realtime=realtime,
+        enforcement=enforcement,
+        loops_in_front=loops_in_front,
+        progress=progress,
+    )
     tables = event_tables(run.logs, run.timing.record_from_ns)
     tables |= meter_tables(run.stalls.seen, tables.get("machine_stall"))
+    tables |= run.tables
+    if "thread_sleep" in tables:
+        moved = events.table(tables, "loop_moved")
+        tables["thread_sleep"] = with_moved_sleeps(tables["thread_sleep"], moved)
     notes = list(_notes(realtime, permitted, run.memory_locked, run.clock_moved_ns))
     if run.was_interrupted:
         tables = dict(events.happened(tables, 0, run.timing.stop_ns))
@@ -164,6 +183,7 @@ class _FinishedRun:
     memory_locked: bool  # in all nodes
     clock_offset_ns: int  # of CLOCK_REALTIME against CLOCK_MONOTONIC, when the run began
     clock_moved_ns: int  # by how much that changed until the end
+    tables: Mapping[str, pl.DataFrame]  # of the enforcement
 
 
 def _run(
@@ -172,6 +192,7 @@ def _run(
     *,
     realtime: bool,
     enforcement: Enforcement | None,
+    loops_in_front: Mapping[str, str],
     progress: Progress,
 ) -> _FinishedRun:
     """Start the nodes, let them run, collect what they recorded, and end them."""
@@ -181,7 +202,7 @@ def _run(
     finished = False
     try:
         progress(0.0, "starting nodes")
-        _start_nodes(application, nodes, realtime)
+        _start_nodes(application, nodes, realtime, loops_in_front)
         with watching as stalls:
             memory_locked = _await_ready(nodes.values())
             _allocate_threads(application, nodes, realtime)
@@ -190,7 +211,7 @@ def _run(
             timing = timing_of(application, cycles, time.monotonic_ns() + lead_ns)
             pids = {node_name(name): child.pid for name, child in nodes.items()}
             started = StartedNodes(pids, timing.anchor_ns, timing.start_ns)
-            with nullcontext() if enforcement is None else enforcement(started):
+            with nullcontext() if enforcement is None else enforcement(started) as tables_of:
                 timing = _sooner(application, cycles, timing)
                 for child in nodes.values():
                     child.tell(**asdict(timing))
@@ -214,7 +235,41 @@ def _run(
         memory_locked=memory_locked,
         clock_offset_ns=offset_ns,
         clock_moved_ns=clock_offset() - offset_ns,
+        tables={} if tables_of is None else tables_of(),
     )
+
+
+def with_moved_sleeps(sleeps: pl.DataFrame, moved: pl.DataFrame) -> pl.DataFrame:
+    """Return the table `thread_sleep` of loops that log their own instants, as they were moved.
+
+    ``moved`` is the table `loop_moved`: the library notes each change right behind the beginning of
+    the sleep that it is for, which the loop has logged before. ``until`` gets what was added.
+    """
+    if moved.is_empty():
+        return sleeps
+    one_off = [LOOP_MOVES.index("asked"), LOOP_MOVES.index("followed")]
+    changes = moved.select(
+        *("pid", "tid", "kept"),
+        changed=pl.col("time"),
+        once=pl.when(pl.col("why").is_in(one_off)).then("added").otherwise(0),
+    ).sort("changed")
+    rows = sleeps.with_row_index("row").sort("time")
+    begun = rows.select("pid", "tid", "time", "row")
+    changes = changes.join_asof(
+        begun, left_on="changed", right_on="time", by=["pid", "tid"], check_sortedness=False
+    )
+    changes = changes.drop_nulls("row").select("pid", "tid", "kept", "once", since="time", at="row")
+    rows = rows.join_asof(
+        changes.sort("since"),
+        left_on="time",
+        right_on="since",
+        by=["pid", "tid"],
+        check_sortedness=False,
+    )
+    is_first = pl.col("row") == pl.col("at")
+    added = pl.col("kept").fill_null(0) + pl.when(is_first).then("once").otherwise(0)
+    rows = rows.with_columns(until=pl.col("until") + added)
+    return rows.sort("row").select(sleeps.columns)
 
 
 def _plan_of_others(
@@ -271,7 +326,12 @@ def _ended_early(children: Iterable[Child], timing: Timing, ended_ns: int) -> Ti
     return replace(early, stop_ns=timing.record_from_ns + early.cycles * timing.period_ns)
 
 
-def _start_nodes(application: Application, nodes: dict[str, Child], realtime: bool) -> None:
+def _start_nodes(
+    application: Application,
+    nodes: dict[str, Child],
+    realtime: bool,
+    loops_in_front: Mapping[str, str],
+) -> None:
     """Start a process for each node, and add it to ``nodes``.
 
     Its arguments name the node as those of ROS 2 do, so that others recognise it.
@@ -285,7 +345,7 @@ def _start_nodes(application: Application, nodes: dict[str, Child], realtime: bo
         nodes[name] = launcher.start_child(
             f"node {name}",
             "chainshaper.workload.node_process",
-            environment,
+            {**environment, **(loops_in_front if application.nodes[name].loop is not None else {})},
             arguments=("--ros-args", "-r", f"__node:={base}", "-r", f"__ns:={namespace or '/'}"),
             libraries=LIBRARIES,
         )

@@ -4,6 +4,7 @@ It talks with :mod:`chainshaper.workload.live` as :mod:`chainshaper.workload.lau
 pages are locked into memory, so it imports nothing that it does not need.
 """
 
+import ctypes
 import os
 import queue
 import signal
@@ -79,6 +80,7 @@ class NodeProcess:
         if callback.loop_ns is not None:
             body = _body(work, publishers, rest)
             topics = callback.reads
+            _tell_library(self.setup.name)
             self.loop = Loop(callback.loop_ns, callback.phase_ns, len(topics), body, self.log)
             self.log.loop(self.setup.name)
             for number, topic in enumerate(topics):
@@ -308,6 +310,18 @@ def _body(
             rest()
 
     return body
+
+
+def _tell_library(node: str) -> None:
+    """Tell the tracing library of the node, if it is in front, so that the loop can be moved.
+
+    It is what rcl does in nodes of ROS 2: `ros_trace_rcl_node_init`.
+    """
+    with suppress(AttributeError):  # the library is not there
+        space, _, name = node.rpartition("/")
+        handles = ctypes.c_void_p(1), ctypes.c_void_p(1)
+        texts = ctypes.c_char_p(name.encode()), ctypes.c_char_p((space or "/").encode())
+        ctypes.CDLL(None).ros_trace_rcl_node_init(*handles, *texts, ctypes.c_void_p(0))
 
 
 def _turn(output: str) -> Turn | None:

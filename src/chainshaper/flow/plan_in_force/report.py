@@ -1,10 +1,10 @@
 """What a run shows of itself: its state, with notes for a person."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from chainshaper.enforcement.undoing import RunState, ServerState, save_run_state
+from chainshaper.enforcement.undoing import LoopStep, RunState, ServerState, save_run_state
 
 
 @dataclass
@@ -22,6 +22,10 @@ class RunReport:
     def replace_notes(self, prefix: str, *notes: str) -> None:
         """Add notes in place of all that begin with a prefix."""
         self.note(*notes, instead=[note for note in self.state.notes if note.startswith(prefix)])
+
+    def show_steps(self, steps: Sequence[LoopStep]) -> None:
+        """Show how loops were kept in step."""
+        self.state = replace(self.state, steps=tuple(steps))
 
     def update_servers(self, update: Callable[[ServerState], ServerState]) -> None:
         """Change what is shown of each server."""

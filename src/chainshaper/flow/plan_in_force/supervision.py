@@ -17,6 +17,7 @@ from chainshaper.flow.anchoring import carried_out
 from chainshaper.flow.phase import Phase
 from chainshaper.flow.plan_in_force.anchor import AnchoredPlan
 from chainshaper.flow.plan_in_force.followers import Followers
+from chainshaper.flow.plan_in_force.loops import LoopsInStep
 from chainshaper.flow.plan_in_force.origins import OriginWatches, follow_timer
 from chainshaper.flow.plan_in_force.phases import PhaseMessages
 from chainshaper.flow.plan_in_force.report import RunReport
@@ -46,6 +47,7 @@ class Supervision:
     report: RunReport
     phases: PhaseMessages
     followers: Followers
+    loops: LoopsInStep
     origins: OriginWatches
     servers: BackEnd
     stop: threading.Event
@@ -73,6 +75,7 @@ class Supervision:
             moved = {place: ns + followed_ns for place, ns in self.seen_drifts().items()}
             self.end_messages()
             self.followers.show(self.report)
+            self.loops.show(self.report, self.threads.latest)
             self.look_at_servers(max(moved.values(), key=abs, default=None))
             if is_over := is_over or self.report.state.failure is not None:
                 self.report.state = replace(self.report.state, ended_ns=time.monotonic_ns())

@@ -6,7 +6,7 @@
 `preload.c` is that library. It sends us the memory of its process with the process's first event
 (:mod:`.tracer`); that of a process that runs already is in `/proc` (:mod:`.running`). A thread
 reads all memories ten times a second, also what a process wrote that was killed in between. What
-puts libraries there is in :mod:`.in_front`.
+puts libraries there is in :mod:`.in_front`. Loops that it sees can be moved (:mod:`.moving`).
 """
 
 from chainshaper.sources.preload.in_front import ANY_ORDER as ANY_ORDER
@@ -19,6 +19,9 @@ from chainshaper.sources.preload.in_front import preloading as preloading
 from chainshaper.sources.preload.memory import RECORD as RECORD
 from chainshaper.sources.preload.memory import TracedProcess as TracedProcess
 from chainshaper.sources.preload.memory import event_names as event_names
+from chainshaper.sources.preload.moving import LoopMoved as LoopMoved
+from chainshaper.sources.preload.moving import LoopMover as LoopMover
+from chainshaper.sources.preload.moving import move_loop as move_loop
 from chainshaper.sources.preload.running import NO_PROCESS as NO_PROCESS
 from chainshaper.sources.preload.running import memories as memories
 from chainshaper.sources.preload.tables import creation_tables as creation_tables

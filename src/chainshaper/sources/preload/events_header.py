@@ -16,7 +16,7 @@ from chainshaper.values.event_declarations import (
     events_of_library,
 )
 
-_LAYOUT = 3
+_LAYOUT = 4
 """To be increased when the memory of a traced process changes otherwise than by its events."""
 
 _TEMPLATE = """\

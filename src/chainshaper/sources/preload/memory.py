@@ -48,8 +48,13 @@ HEADER = np.dtype(
         ("unused", "<u8", 2),
     ]
 )
-RING = np.dtype([("written", "<u8"), ("taken", "<u4"), ("unused", "<u4", 13)])
-"""The head of a thread's ring: how many records were written, and whether a thread has it."""
+REQUEST = np.dtype(
+    [(name, "<u8") for name in ("number", "tid", "move", "period", "until", "check")]
+)
+"""`struct request` of `preload.c`: how a loop is asked to be moved (:mod:`.moving`)."""
+RING = np.dtype([("written", "<u8"), ("taken", "<u4"), ("unused", "<u4"), ("asked", REQUEST)])
+"""The head of a thread's ring: how many records were written, the id of the thread that has it (0:
+none has), and what is asked of its loop."""
 
 MAGIC = 0x63687368  # the first word of a memory
 # Numbers of events: a part of a text, the tracing library behind ours, then those of ROS 2.
@@ -57,7 +62,7 @@ TEXT, LIBRARY, FIRST_EVENT = 1, 2, 3
 _PLACES = 16  # of arguments that a text can belong to
 _RINGS, _RING_RECORDS, _OBJECT_RECORDS = 64, 1 << 14, 1 << 15  # of this format, no others
 # Where in a memory records of creation, and those of rings, begin (bytes); and its size.
-_OF_OBJECTS = HEADER.itemsize + _RINGS * RING.itemsize
+HEAD_BYTES = _OF_OBJECTS = HEADER.itemsize + _RINGS * RING.itemsize
 _OF_RECORDS = _OF_OBJECTS + _OBJECT_RECORDS * RECORD.itemsize
 _SIZE = _OF_RECORDS + _RINGS * _RING_RECORDS * RECORD.itemsize
 _F_GET_SEALS, _F_SEAL_SHRINK = 1034, 2  # linux/fcntl.h
@@ -162,10 +167,15 @@ class TracedProcess:
             return 1
         return dropped
 
-    def new_records(self) -> list[NDArray[Any]]:
-        """Return the records that came into each ring since the last time, in order of writing."""
+    def new_records(self, only: int | None = None) -> list[NDArray[Any]]:
+        """Return the records that came into each ring since the last time, in order of writing.
+
+        ``only``: the number of a ring; None: all of them.
+        """
         new = list[NDArray[Any]]()
         for number in np.flatnonzero(self._rings["written"] != self._read):
+            if only not in (None, number):
+                continue
             ring, read = self._records[number], int(self._read[number])
             written = int(self._rings["written"][number])
             if not read <= written < read + _MOST_WRITTEN:
@@ -191,6 +201,11 @@ class TracedProcess:
                 if good:
                     new.append(self._with_tids_here(records[:good]))
         return new
+
+    @property
+    def taken(self) -> NDArray[np.uint32]:
+        """The thread that has each ring, by its id in its container; 0: none has it."""
+        return np.array(self._rings["taken"], np.uint32)
 
     def _good(self, records: NDArray[Any], known: NDArray[np.bool_]) -> int:
         """Return how many records stand before the first that the library cannot have written.

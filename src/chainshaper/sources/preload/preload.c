@@ -31,7 +31,8 @@
 // A loop that is no callback (a control loop in a thread of its own) is seen by how its thread sleeps:
 // we stand in front of the functions by which threads sleep for a time (`SLEEPS`). Sleeps are recorded
 // of threads that publish outside callbacks, and of loops that the user named in CHAINSHAPER_LOOPS.
-// All others pass by two comparisons.
+// All others pass by two comparisons. The sleeps of such a loop can be moved: another process asks for
+// it in the ring of the thread (`struct request`).
 //
 // Times are ns of CLOCK_MONOTONIC. Values are a function's arguments as they are in registers (of a
 // bool only the lowest byte counts). Calls of services have trace points from Kilted on only; so we
@@ -77,6 +78,7 @@
 #define LONGEST_TEXT 4096u
 #define TEXT_BYTES 40u  // in one record
 #define MOST_NESTED 8u  // callbacks, one within the other, of which it is known where they began
+#define STEPS 8u  // so many steps of a loop from sleep to sleep show whether it has instants of its own
 enum { TEXT = 1, LIBRARY = 2, FIRST_EVENT = 3 };
 
 struct record {
@@ -87,10 +89,24 @@ struct record {
   uint64_t values[6];      // of a text: 16 × its length + the argument's place, then its bytes
 };
 
+// What another process asks of the loop of a thread: to wake up by `move` later than it would by
+// itself. It writes at any time, and may be killed in the midst of it: the request counts once `check`
+// is right. From `until` on nobody asks any more, and the loop goes back to its own instants.
+struct request {
+  _Atomic uint64_t number;  // increases with each; 0: there is none
+  _Atomic uint64_t tid;     // of the thread, since a ring goes from a thread that ends to another
+  _Atomic uint64_t move;    // ns; shorter than the period
+  _Atomic uint64_t period;  // of the loop (ns)
+  _Atomic uint64_t until;   // ns of CLOCK_MONOTONIC; 0: for ever
+  _Atomic uint64_t check;   // all of them combined, and CHECK
+};
+#define CHECK UINT64_C(0x6d6f76656c6f6f70)
+
 struct ring {
   _Atomic uint64_t written;
-  _Atomic uint32_t taken;  // by a thread
-  uint32_t unused[13];
+  _Atomic uint32_t taken;  // by the thread of this id; 0: by none
+  uint32_t unused;
+  struct request asked;
 };
 
 struct memory {
@@ -142,6 +158,22 @@ static __thread struct {
     uintptr_t frame;  // of the stack, where it was announced
   } callback[MOST_NESTED];
   uint16_t latest;  // event
+  // Of the loop, from the first request to move it on.
+  struct {
+    uint64_t number;          // of the request that it follows; 0: it follows none
+    uint64_t period;          // ns, as all here
+    uint64_t move;            // that was asked for
+    uint64_t wanted;          // until when it wanted to sleep the last time, by itself
+    uint64_t kept;            // what is added to each sleep, since its own instants do not move
+    int64_t tried;            // of what was added to the last sleep, that which is to show what follows
+    int64_t added;            // to the last sleep
+    int64_t steps[STEPS];     // from one wanted instant to the next, the latest ones
+    unsigned seen;            // how many steps there were
+    unsigned against;         // signs that what is kept changes the loop's rate
+    enum { UNKNOWN, OWN_INSTANTS, FOLLOWS } counts;
+    bool interrupted;         // its last sleep, of which it gets the rest
+    bool given_back;          // nobody asks any more, or its rate would change
+  } loop;
 } thread;
 
 static inline uint64_t now(clockid_t clock) {
@@ -395,7 +427,7 @@ static bool has_ring(void) {
   struct memory *all = memory;
   for (unsigned number = 0; number < RINGS; number++) {
     uint32_t none = 0;
-    if (!atomic_compare_exchange_strong(&all->ring[number].taken, &none, 1)) continue;
+    if (!atomic_compare_exchange_strong(&all->ring[number].taken, &none, thread.tid)) continue;
     int before = errno;
     bool has_room = claim(all->records[number], sizeof all->records[number]);
     errno = before;
@@ -774,6 +806,167 @@ static void end_sleep(int call) {
   errno = before;
 }
 
+// How a loop is moved. What is asked for, and where the loop counts from, decide what is added:
+//
+// * Loops that sleep until instants of their own (`sleep_until(next); next += period`, `rclcpp::Rate`)
+//   do not move when one sleep is longer: it is added to each.
+// * Where the next sleep follows from when the last one ended (`sleep_for`, the timer of a timerfd that
+//   is set anew), it is added to one sleep.
+//
+// To know which, one sleep is made longer, and the loop looked at: whether the instants until which it
+// wants to sleep have come as they did before. That shows only where they came regularly.
+//
+// What is added goes back at once where it changes the loop's rate: a loop that checks for overruns
+// leaves out instances where too little time is left for its work.
+enum { ASKED, KEPT, FOLLOWED, RATE_CHANGED, OVER };  // places in LOOP_MOVES
+#define EXACT INT64_C(20000)     // ns: steps of a loop with its own instants differ by no more
+#define PLAIN (4 * EXACT)       // a move by more shows where the loop counts from
+#define SHORTEN 16              // a sleep is made shorter by no more than this part of the period
+#define MOST_AGAINST 12u         // three signs in turn that the loop follows, six of instances left out
+#define LONGEST_PERIOD 10000000000u
+#define SHORTEST_PERIOD 10000u
+
+static void note_move(int64_t added, unsigned why) {
+  uint64_t values[6] = {thread.loop.number, thread.loop.move, (uint64_t)added, thread.loop.kept, why};
+  write_record(number_loop_moved, 0, 5, values, false);
+}
+
+// How far a time is from whole periods of the loop, between half a period less and more.
+static int64_t off_by(int64_t time) {
+  int64_t period = (int64_t)thread.loop.period, rest = time % period;
+  if (rest < 0) rest += period;
+  return rest > period / 2 ? rest - period : rest;
+}
+
+static int64_t size_of(int64_t time) { return time < 0 ? -time : time; }
+
+static bool has_exact_steps(void) {
+  unsigned exact = 0;
+  for (unsigned place = 0; place < STEPS; place++)
+    exact += size_of(off_by(thread.loop.steps[place])) <= EXACT;
+  return exact >= STEPS - 2;
+}
+
+// The request for this thread's loop; false: there is none, or it is being written.
+static bool read_request(struct request *asked) {
+  struct request *there = &thread.ring->asked;
+  asked->number = there->number;
+  asked->tid = there->tid;
+  asked->move = there->move;
+  asked->period = there->period;
+  asked->until = there->until;
+  uint64_t check = asked->number ^ asked->tid ^ asked->move ^ asked->period ^ asked->until ^ CHECK;
+  return check == there->check && asked->number && asked->tid == thread.tid &&
+         asked->period >= SHORTEST_PERIOD && asked->period <= LONGEST_PERIOD &&
+         asked->move < asked->period;
+}
+
+// See what the sleep that was made longer has shown, or whether what is kept changes the rate.
+static void see_step(int64_t step) {
+  int64_t off = off_by(step), tried = off_by(thread.loop.tried);
+  if (thread.loop.tried) {
+    bool stays = size_of(off) < size_of(off - tried);
+    thread.loop.counts = stays ? OWN_INSTANTS : FOLLOWS;
+    thread.loop.kept = stays ? thread.loop.move : 0;
+    thread.loop.tried = 0;
+    note_move(0, stays ? KEPT : FOLLOWED);
+    return;
+  }
+  if (!thread.loop.kept) return;
+  int64_t kept = off_by((int64_t)thread.loop.kept);
+  bool follows = size_of(off) > EXACT && size_of(off - kept) < size_of(off);
+  bool leaves_out = step > (int64_t)(thread.loop.period + thread.loop.period / 2);
+  if (follows || leaves_out)
+    thread.loop.against += follows ? 4 : 2;
+  else if (thread.loop.against)
+    thread.loop.against--;
+  if (thread.loop.against < MOST_AGAINST) return;
+  int64_t back = -(int64_t)thread.loop.kept;
+  thread.loop.against = 0;
+  thread.loop.kept = 0;
+  thread.loop.given_back = !follows;
+  if (follows) thread.loop.counts = FOLLOWS;
+  note_move(back, follows ? FOLLOWED : RATE_CHANGED);
+}
+
+// Begin to follow a request; return what is added to this sleep beside what is kept.
+static int64_t follow(const struct request *asked) {
+  uint64_t before = thread.loop.number ? thread.loop.move : 0;
+  int64_t period = (int64_t)asked->period, change = (int64_t)asked->move - (int64_t)before;
+  thread.loop.number = asked->number;
+  thread.loop.move = asked->move;
+  thread.loop.given_back = false;
+  thread.loop.against = 0;
+  if (thread.loop.counts == UNKNOWN && !has_exact_steps()) thread.loop.counts = FOLLOWS;
+  bool is_plain = size_of(off_by(change)) >= PLAIN;
+  if (thread.loop.counts == OWN_INSTANTS || (thread.loop.counts == UNKNOWN && !is_plain)) {
+    thread.loop.kept = asked->move;
+    note_move(change, KEPT);
+    return 0;
+  }
+  if (change < -period / SHORTEN) change += period;
+  if (change > period - period / SHORTEN) change -= period;
+  if (thread.loop.counts == UNKNOWN) thread.loop.tried = change;
+  note_move(change, thread.loop.counts == UNKNOWN ? ASKED : FOLLOWED);
+  return change;
+}
+
+// What is added to the sleep of a loop that wants to sleep until then. `is_rest`: it may be what is
+// left of a sleep that was interrupted.
+static int64_t added_to(uint64_t wanted, bool is_rest) {
+  struct request asked;
+  if (!thread.ring || !*memory_is_ours) return 0;
+  if (__builtin_expect(!thread.ring->asked.number, 1) && !thread.loop.number) return 0;
+  bool goes_on = thread.loop.interrupted && is_rest;
+  thread.loop.interrupted = false;
+  if (goes_on) return 0;
+  bool is_there = read_request(&asked);
+  if (is_there) thread.loop.period = asked.period;
+  if (!thread.loop.period) return 0;
+  int64_t step = (int64_t)(wanted - thread.loop.wanted);
+  bool again = thread.loop.wanted && size_of(step) < (int64_t)(thread.loop.period / 16);
+  if (again) return thread.loop.added;  // until the same instant
+  if (thread.loop.wanted) {
+    thread.loop.steps[thread.loop.seen++ % STEPS] = step;
+    see_step(step);
+  }
+  thread.loop.wanted = wanted;
+  bool is_over = is_there && asked.until && now(CLOCK_MONOTONIC) > asked.until;
+  int64_t added = 0;
+  if (is_over && thread.loop.number && !thread.loop.given_back) {
+    int64_t back = -(int64_t)thread.loop.kept;
+    thread.loop.kept = thread.loop.move = 0;
+    thread.loop.given_back = true;
+    note_move(back, OVER);
+  } else if (is_there && !is_over && asked.number != thread.loop.number &&
+             thread.loop.seen >= STEPS) {
+    added = follow(&asked);
+  }
+  return thread.loop.added = (int64_t)thread.loop.kept + added;
+}
+
+static struct timespec plus(const struct timespec *time, int64_t added) {
+  int64_t rest = time->tv_nsec + added % 1000000000;
+  struct timespec sum = {time->tv_sec + added / 1000000000 + rest / 1000000000, rest % 1000000000};
+  if (sum.tv_nsec >= 0) return sum;
+  sum.tv_nsec += 1000000000;
+  sum.tv_sec--;
+  return sum;
+}
+
+// Begin a sleep that may be moved: `time` becomes `moved` then. No sleep becomes one for no time.
+static bool begin_movable(int call, uint64_t until, bool is_rest, const struct timespec **time,
+                          struct timespec *moved) {
+  if (until == NO_SLEEP) return false;
+  int64_t added = until ? added_to(until, is_rest) : 0;
+  if (added) {
+    *moved = plus(*time, added);
+    if (moved->tv_sec < 0) *moved = (struct timespec){0, 0};
+    *time = moved;
+  }
+  return begin_sleep(call, until + (uint64_t)added);
+}
+
 // `behind_NAME`: the function of the C library behind ours. It is looked up when ours is loaded: these
 // may be called in a signal's handler, where looking up is not allowed. Only what is called still
 // earlier, by a library that is loaded before ours, looks it up itself. A program that looks for a
@@ -806,17 +999,68 @@ static void end_sleep(int call) {
   }
 #define FAILS (errno = ENOSYS, -1)
 typedef const struct timespec *time_of;
-SLEEPS(int, clock_nanosleep, (clockid_t clock, int flags, time_of time, struct timespec *rest),
-       (clock, flags, time, rest), clock_nanosleep,
-       flags & TIMER_ABSTIME ? at(clock, time) : in_time(time), ENOSYS)
-SLEEPS(int, nanosleep, (time_of time, struct timespec *rest), (time, rest), nanosleep, in_time(time),
-       FAILS)
-SLEEPS(int, usleep, (useconds_t time), (time), nanosleep, in((uint64_t)time * 1000u), FAILS)
+
+// Whether a sleep is recorded; `time` is another one then if the loop is moved.
+#define BEGINS_MOVABLE(call, until, is_rest, moved) ({ \
+    int before = errno; \
+    bool begins = is_followed(call, HERE) && begin_movable(call, until, is_rest, &time, moved); \
+    errno = before; \
+    begins; \
+  })
+
+LIBC(int, clock_nanosleep, (clockid_t clock, int flags, time_of time, struct timespec *rest))
+int clock_nanosleep(clockid_t clock, int flags, time_of time, struct timespec *rest) {
+  if (IS_MISSING(clock_nanosleep)) return ENOSYS;
+  const int call = sleeps_by_clock_nanosleep;
+  const bool is_absolute = flags & TIMER_ABSTIME;
+  struct timespec moved;
+  bool recorded = BEGINS_MOVABLE(call, is_absolute ? at(clock, time) : in_time(time), !is_absolute,
+                                 &moved);
+  int result = behind_clock_nanosleep(clock, flags, time, rest);
+  if (recorded) thread.loop.interrupted = result == EINTR && !is_absolute && rest;
+  if (recorded) end_sleep(call);
+  return result;
+}
+
+LIBC(int, nanosleep, (time_of time, struct timespec *rest))
+int nanosleep(time_of time, struct timespec *rest) {
+  if (IS_MISSING(nanosleep)) return FAILS;
+  struct timespec moved;
+  bool recorded = BEGINS_MOVABLE(sleeps_by_nanosleep, in_time(time), true, &moved);
+  int result = behind_nanosleep(time, rest);
+  if (recorded) thread.loop.interrupted = result && errno == EINTR && rest;
+  if (recorded) end_sleep(sleeps_by_nanosleep);
+  return result;
+}
+
+LIBC(int, usleep, (useconds_t time))
+int usleep(useconds_t microseconds) {
+  if (IS_MISSING(usleep)) return FAILS;
+  struct timespec moved, given = {microseconds / 1000000, microseconds % 1000000 * 1000L};
+  time_of time = &given;
+  bool recorded = BEGINS_MOVABLE(sleeps_by_nanosleep, in_time(time), true, &moved);
+  if (time == &moved)
+    microseconds = (useconds_t)(moved.tv_sec * 1000000 + moved.tv_nsec / 1000);
+  int result = behind_usleep(microseconds);
+  if (recorded) end_sleep(sleeps_by_nanosleep);
+  return result;
+}
+
+LIBC(int, pthread_cond_clockwait,
+     (pthread_cond_t *condition, pthread_mutex_t *mutex, clockid_t clock, time_of time))
+int pthread_cond_clockwait(pthread_cond_t *condition, pthread_mutex_t *mutex, clockid_t clock,
+                           time_of time) {
+  if (IS_MISSING(pthread_cond_clockwait)) return ENOSYS;
+  const int call = sleeps_by_pthread_cond_clockwait;
+  struct timespec moved;
+  bool recorded = BEGINS_MOVABLE(call, at(clock, time), false, &moved);
+  int result = behind_pthread_cond_clockwait(condition, mutex, clock, time);
+  if (recorded) end_sleep(call);
+  return result;
+}
+
 SLEEPS(unsigned, sleep, (unsigned time), (time), nanosleep, in((uint64_t)time * 1000000000u),
        time)
-SLEEPS(int, pthread_cond_clockwait,
-       (pthread_cond_t *condition, pthread_mutex_t *mutex, clockid_t clock, time_of time),
-       (condition, mutex, clock, time), pthread_cond_clockwait, at(clock, time), ENOSYS)
 SLEEPS(int, poll, (struct pollfd *files, nfds_t count, int time), (files, count, time), poll,
        in_milliseconds(time), FAILS)
 SLEEPS(int, ppoll, (struct pollfd *files, nfds_t count, time_of time, const sigset_t *signals),
@@ -880,7 +1124,9 @@ int pthread_cond_timedwait(pthread_cond_t *condition, pthread_mutex_t *mutex, ti
   if (IS_MISSING(pthread_cond_timedwait)) return ENOSYS;
   const int call = sleeps_by_pthread_cond_timedwait;
   const void *caller = __builtin_return_address(0);
-  bool recorded = BEGINS(call, is_of_interpreter(caller) ? NO_SLEEP : at_either(time));
+  struct timespec moved;
+  bool recorded = BEGINS_MOVABLE(call, is_of_interpreter(caller) ? NO_SLEEP : at_either(time), false,
+                                 &moved);
   int result = behind_pthread_cond_timedwait(condition, mutex, time);
   if (recorded) end_sleep(call);
   return result;
@@ -926,11 +1172,29 @@ static bool is_timer(int file) {
   return sleeps;
 }
 
+// Set a timer later whose loop is to be moved. One that has expired already is left alone: setting it
+// would take the expiry away.
+static void move_timer(int file) {
+  struct pollfd expired = {.fd = file, .events = POLLIN};
+  struct itimerspec left;
+  int before = errno;
+  bool waits = behind_poll && behind_poll(&expired, 1, 0) == 0 && timerfd_gettime(file, &left) == 0;
+  uint64_t until = waits ? in(duration(left.it_value.tv_sec, left.it_value.tv_nsec, 1000000000)) : 0;
+  int64_t added = until && until != NO_SLEEP ? added_to(until, false) : 0;
+  if (added) {
+    left.it_value = plus(&left.it_value, added);
+    bool is_left = left.it_value.tv_sec > 0 || (!left.it_value.tv_sec && left.it_value.tv_nsec > 0);
+    if (is_left) timerfd_settime(file, 0, &left, NULL);
+  }
+  errno = before;
+}
+
 LIBC(ssize_t, read, (int file, void *buffer, size_t size))
 ssize_t read(int file, void *buffer, size_t size) {
   if (IS_MISSING(read)) return FAILS;
   const int call = sleeps_by_timerfd;
   bool recorded = is_timer(file) && BEGINS(call, 0);
+  if (recorded && thread.ring && thread.ring->asked.number) move_timer(file);
   ssize_t result = behind_read(file, buffer, size);
   if (recorded) end_sleep(call);
   return result;

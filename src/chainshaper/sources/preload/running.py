@@ -1,14 +1,15 @@
 """Processes that run with the tracing library in front: found in `/proc`, by their memory."""
 
+import mmap
 import os
 import re
 import stat
 from collections.abc import Callable, Collection, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from chainshaper.linux.threads import innermost_id, read_proc
-from chainshaper.sources.preload.memory import RefusedMemoryError, TracedProcess
+from chainshaper.sources.preload.memory import HEAD_BYTES, RefusedMemoryError, TracedProcess
 from chainshaper.values.errors import InputError, text_of
 
 NO_PROCESS = (
@@ -65,23 +66,53 @@ def left_out(pid: int, why: Exception, sent_name: str = "") -> str:
     return f"nothing of process {pid}{called} is recorded: {why}."
 
 
+@contextmanager
+def _regular(descriptor: Path) -> Iterator[Path | None]:
+    """Give a path by which a memory that a process has open may be opened; None: it is none.
+
+    Anything may have the name of a memory, and opening a pipe or a device may wait for ever or do
+    something: so the file is looked at before. Raises OSError.
+    """
+    if not _MEMORY.match(os.fsencode(descriptor.readlink())):
+        yield None
+        return
+    place = os.open(descriptor, os.O_PATH | os.O_CLOEXEC)
+    try:
+        is_regular = stat.S_ISREG(os.fstat(place).st_mode)
+        yield Path(f"/proc/self/fd/{place}") if is_regular else None
+    finally:
+        os.close(place)
+
+
+def memory_to_write(pid: int) -> tuple[mmap.mmap, TracedProcess] | None:
+    """Map the head of a process's memory, to be written, and open the memory; None: it has none.
+
+    Raises OSError: it has ended, or may not be looked into or written to.
+    """
+    inner_pid = innermost_id(read_proc(f"/proc/{pid}/status"))
+    for descriptor in Path(f"/proc/{pid}/fd").iterdir():
+        with suppress(FileNotFoundError, InputError), _regular(descriptor) as path:
+            if path is None:
+                continue
+            with path.open("r+b") as file:
+                process = TracedProcess(file.fileno(), pid)
+                if process.inner_pid == inner_pid:
+                    return mmap.mmap(file.fileno(), HEAD_BYTES), process
+    return None
+
+
 def _memory_of(descriptor: Path, pid: int) -> TracedProcess | RefusedMemoryError | None:
     """Return the memory behind an open file of a process, in `/proc`; None: it is another file.
 
-    Anything may have the name of a memory, and opening a pipe or a device may wait for ever or do
-    something: so the file is looked at before it is opened for reading. Raises OSError.
+    Raises OSError.
     """
-    if not _MEMORY.match(os.fsencode(descriptor.readlink())):
-        return None
-    place = os.open(descriptor, os.O_PATH | os.O_CLOEXEC)
-    try:
-        if not stat.S_ISREG(os.fstat(place).st_mode):
+    with _regular(descriptor) as path:
+        if path is None:
             return None
-        with Path(f"/proc/self/fd/{place}").open("rb") as file:
-            return TracedProcess(file.fileno(), pid)
-    except RefusedMemoryError as refused:
-        return refused
-    except InputError:
-        return None
-    finally:
-        os.close(place)
+        try:
+            with path.open("rb") as file:
+                return TracedProcess(file.fileno(), pid)
+        except RefusedMemoryError as refused:
+            return refused
+        except InputError:
+            return None

@@ -1,0 +1,146 @@
+"""A plan that is applied to an application that runs keeps its output and loop in step."""
+
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from small_chain import DDS_CORE, EXECUTOR_CORE
+
+from chainshaper.enforcement.undoing import RunState
+from chainshaper.flow.apply import apply_plan
+from chainshaper.linux.scheduling import may_use_fifo
+from chainshaper.planning import plan_shaping
+from chainshaper.planning.chain_plan import LoopAge, PlannedLoop, publish_slots, revised
+from chainshaper.planning.plan import Plan
+from chainshaper.reporting.overviews import servers_table
+from chainshaper.sources.preload import in_front, installed_library, named_loops
+from chainshaper.splicing.application import splice_application
+from chainshaper.workload.description import load_application
+from chainshaper.workload.launcher import LOOP_NAME
+from chainshaper.workload.live import StartedNodes, run_application
+
+pytestmark = [
+    pytest.mark.timed,
+    pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here"),
+]
+
+MS = 1_000_000
+TEXT = f"""\
+name: in step
+chain: /scan../command
+scheduling:
+  executors: {{core: {EXECUTOR_CORE}, priority: 80}}
+  dds: {{core: {DDS_CORE}, priority: 90}}
+nodes:
+  sensor: {{callbacks: [{{timer: 50ms, execution: {{uniform: [1ms, 3ms]}}, publishes: [/scan]}}]}}
+  controller:
+    callbacks:
+      - loop: 10ms
+        phase: 1ms
+        reads: [/scan]
+        execution: {{constant: 500us}}
+        publishes: [/command]
+  driver: {{callbacks: [{{subscription: /command, execution: {{constant: 10us}}}}]}}
+"""
+
+
+def planned(moves: Any) -> Plan:
+    chain = plan_shaping(
+        np.array([3 * MS, 20 * MS]),
+        50 * MS,
+        spec="/scan..",
+        output="/scan",
+        publisher="/sensor",
+        nodes=("/sensor",),
+    )
+    start = publish_slots(chain)[0][0]
+    loop = PlannedLoop(
+        node="/controller",
+        thread=LOOP_NAME,
+        topic="/scan",
+        period_ns=10 * MS,
+        samples=1,
+        delivery_ns=(0, MS, MS),
+        lead_ns=2 * MS,
+        in_step=moves,
+        starts_ns=(start, start + 15 * MS) if moves == "output" else None,
+        move_ns=0 if moves == "loop" else None,
+        age=LoopAge(first_ns=(0, 0), every_ns=(0, 0), constant=True, uses=(5, 5)),
+    )
+    return Plan.of(revised(chain, loop=loop))
+
+
+@pytest.mark.parametrize(
+    ("moves", "beneath"), [("loop", True), ("output", True), ("output", False), ("loop", False)]
+)
+def test_an_applied_plan_keeps_output_and_loop_in_step(
+    tmp_path: Path, moves: str, beneath: bool
+) -> None:
+    """Beneath the library and, where only the output is moved, without it."""
+    (tmp_path / "app.yaml").write_text(TEXT)
+    plan = planned(moves)
+    application = splice_application(load_application(tmp_path / "app.yaml"), plan)
+    front = {}
+    if beneath:
+        names = named_loops.names_text([LOOP_NAME])
+        front = {**in_front(installed_library()), named_loops.VARIABLE: names}
+    started, over = threading.Event(), threading.Event()
+    states = list[RunState]()
+
+    def watch(state: RunState) -> None:
+        states.append(state)
+        waits = any("are not in step: no such loop" in note for note in state.notes)
+        if state.steps or (waits and len(states) > 4):
+            over.set()
+
+    def enforcement(nodes: StartedNodes) -> Any:
+        from contextlib import nullcontext
+
+        assert nodes.pids
+        started.set()
+        return nullcontext()
+
+    with ThreadPoolExecutor() as pool:
+        ran = pool.submit(
+            run_application,
+            application,
+            tmp_path / "recording",
+            cycles=500,
+            enforcement=enforcement,
+            loops_in_front=front,
+        )
+        assert started.wait(60)
+        time.sleep(3)  # until its timers run
+        stop = threading.Event()
+        applied = pool.submit(
+            apply_plan,
+            plan,
+            back_end="fifo",
+            wait_ns=20_000_000_000,
+            folder=tmp_path / "runs",
+            stop=stop,
+            watch=watch,
+        )
+        until = time.monotonic() + 60
+        while not (over.is_set() or applied.done() or ran.done()) and time.monotonic() < until:
+            time.sleep(0.1)
+        stop.set()
+        final = applied.result().state
+        ran.cancel()
+        recording = ran.result()
+    if moves == "loop" and not beneath:
+        assert any("start it beneath the library in front" in note for note in final.notes)
+        return
+    assert final.steps, final.notes
+    first = final.steps[0]
+    assert (first.moves, first.loop) == (moves, "/controller")
+    assert first.moved_ns is not None and 0 <= first.moved_ns < 15 * MS
+    assert "its phase was measured" in first.why
+    assert final.steps[-1].text in str(servers_table(final).caption)
+    if moves == "output":
+        moved = recording.events["gate_release"]["moved"].unique().sort().to_list()
+        assert moved[0] == 0 and first.moved_ns in moved

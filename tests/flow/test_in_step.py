@@ -1,0 +1,280 @@
+"""Outputs and loops in step: clocks that drift for half an hour, restarts, places out of reach."""
+
+import random
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, cast
+
+import pytest
+from small_chain import small_chain_plan
+
+from chainshaper.flow import in_step
+from chainshaper.flow.in_step import InStep, OwnStarts, loops_in_step, next_move
+from chainshaper.planning.chain_plan import (
+    ChainPlan,
+    LoopAge,
+    PlannedLoop,
+    loop_common_ns,
+    publish_slots,
+    revised,
+)
+from chainshaper.planning.plan import Plan
+from chainshaper.sources.preload import LoopMoved
+from chainshaper.values.errors import InputError
+
+MS, S = 1_000_000, 1_000_000_000
+LEAD = 1 * MS
+LOOK_S = 0.5  # of the time in the tests' worlds
+AGE = LoopAge(first_ns=(0, 0), every_ns=(0, 0), constant=True, uses=(1, 1))
+
+
+def plan_in_step(moves: str, period_ns: int = 10 * MS, latest_ns: int = 45 * MS) -> ChainPlan:
+    """The small chain, every 50 ms, with a loop."""
+    chain = small_chain_plan(10 * MS, 20 * MS)
+    starts_ns = publish_slots(chain)[0][0], latest_ns
+    loop = PlannedLoop(
+        node="/controller",
+        topic="/t3",
+        period_ns=period_ns,
+        samples=1,
+        delivery_ns=(0, 0, 0),
+        lead_ns=LEAD,
+        in_step=cast("Any", moves),
+        starts_ns=starts_ns if moves == "output" else None,
+        move_ns=0 if moves == "loop" else None,
+        age=AGE,
+    )
+    return revised(chain, loop=loop)
+
+
+@dataclass
+class World:
+    """A chain and a loop whose clocks differ, as they are seen from look to look (ns)."""
+
+    plan: ChainPlan
+    ppm: float
+    first_ns: int = 1_000 * S + 3_456_789
+    work_ns: int = 0  # of the loop; it leaves instances out where a move leaves it too little time
+    now_ns: int = 1_000 * S
+    moved_ns: int = 0  # the output's slots
+    kept_ns: int = 0  # what is added to the loop's sleeps
+    asked: list[int] = field(default_factory=list)
+    moves: list[LoopMoved] = field(default_factory=list)
+    given_back: int = 0
+    turn_ns: int = 0  # is not seen
+    alive: bool = True
+    draw: random.Random = field(default_factory=lambda: random.Random(1))
+    tid: int = 7
+
+    @property
+    def period_ns(self) -> float:
+        assert self.plan.loop is not None and self.plan.loop.period_ns is not None
+        return self.plan.loop.period_ns * (1 + self.ppm * 1e-6)
+
+    def own_start(self, instant_ns: int) -> int:
+        """The latest start of the loop by itself before an instant."""
+        turns = (instant_ns - self.first_ns) // self.period_ns
+        return round(self.first_ns + turns * self.period_ns)
+
+    # As the output that is followed
+
+    def origins(self, cycle_ns: int) -> list[int]:
+        return [self.now_ns - self.now_ns % cycle_ns + self.draw.randrange(20_000)]
+
+    def move_output(self, by_ns: int, _: int) -> None:
+        self.moved_ns = by_ns
+        self.asked.append(by_ns)
+
+    # As the loop that is followed
+
+    @property
+    def is_there(self) -> bool:
+        return self.alive
+
+    def seen(self) -> tuple[list[int], list[LoopMoved]]:
+        since, starts = self.now_ns - round(LOOK_S * S), list[int]()
+        start = self.own_start(self.now_ns)
+        while start > since - self.kept_ns:
+            starts.insert(0, start + self.kept_ns + self.draw.randrange(20_000))
+            start = round(start - self.period_ns)
+        moves, self.moves = self.moves, []
+        return [at for at in starts if since < at <= self.now_ns], moves
+
+    def move(self, move_ns: int, period_ns: int) -> int:
+        assert 0 <= move_ns < period_ns
+        number = len(self.asked) + 1
+        self.asked.append(move_ns)
+        added = move_ns - self.kept_ns
+        self.moves.append(LoopMoved(self.now_ns, number, move_ns, added, move_ns, "kept"))
+        self.kept_ns = move_ns
+        if move_ns + self.work_ns > self.period_ns:
+            back = LoopMoved(self.now_ns + 1, number, move_ns, -move_ns, 0, "rate changed")
+            self.moves.append(back)
+            self.given_back += 1
+            self.kept_ns = 0
+        return number
+
+    def renew(self) -> None: ...
+    def close(self) -> None: ...
+
+    # What comes of it
+
+    def off_ns(self) -> int:
+        """How far the loop's next start is from the lead behind the output."""
+        slot = publish_slots(self.plan)[0][0] + self.moved_ns
+        cycle = self.now_ns - self.now_ns % self.plan.cycle_ns
+        lead = self.own_start(self.now_ns) + self.kept_ns - cycle - slot - LEAD
+        step = loop_common_ns(self.plan)
+        return (lead + step // 2) % step - step // 2
+
+
+class _Output:
+    """In place of FollowedOutput."""
+
+    def __init__(self, world: World) -> None:
+        self.origins, self.move = world.origins, world.move_output
+
+    def close(self) -> None: ...
+
+
+@pytest.fixture
+def follow(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[World], InStep]]:
+    """Makes what keeps a world in step; it looks only when it is asked to."""
+    made = list[InStep]()
+
+    def make(world: World) -> InStep:
+        monkeypatch.setattr(InStep, "_follow", lambda _: None)
+        monkeypatch.setattr(in_step, "LOOK_S", LOOK_S)
+        monkeypatch.setattr(in_step, "FollowedOutput", lambda *_: _Output(world))
+        found = lambda: cast("Any", world) if world.alive else None  # noqa: E731
+        kept = InStep(world.plan, (), found, lambda _: world.now_ns)
+        made.append(kept)
+        return kept
+
+    yield make
+    for kept in made:
+        kept.end()
+
+
+def run(world: World, kept: InStep, seconds: float) -> list[int]:
+    """How far off the loop was, look by look."""
+    off = list[int]()
+    for _ in range(round(seconds / LOOK_S)):
+        world.now_ns += round(LOOK_S * S)
+        kept.look()
+        off.append(world.off_ns())
+    return off
+
+
+@pytest.mark.parametrize("ppm", [-50.0, 0.0, 50.0])
+@pytest.mark.parametrize(("period_ns", "seconds"), [(10 * MS, 1800), (MS, 120), (100 * MS, 600)])
+def test_a_loop_that_is_moved_stays_in_step(
+    follow: Callable[..., InStep], ppm: float, period_ns: int, seconds: int
+) -> None:
+    world = World(plan_in_step("loop", period_ns), ppm)
+    kept = follow(world)
+    run(world, kept, 10)
+    assert kept.is_in_step
+    moved = len(world.asked)
+    off = run(world, kept, seconds)
+    assert max(map(abs, off)) < 75_000
+    assert world.moved_ns == 0  # the output stays
+    # 50 ppm are 90 ms in half an hour; where nothing drifts, nothing is moved.
+    assert len(world.asked) - moved < (20 if ppm == 0 else 90 * MS // in_step.TOLERANCE_NS + 50)
+    assert all(0 <= asked < world.period_ns for asked in world.asked)
+
+
+@pytest.mark.parametrize("ppm", [-50.0, 50.0])
+def test_an_output_that_is_moved_leaves_the_lead_before_the_loop(
+    follow: Callable[..., InStep], ppm: float
+) -> None:
+    world = World(plan_in_step("output"), ppm)
+    kept = follow(world)
+    run(world, kept, 10)
+    off = run(world, kept, 1800)
+    assert max(map(abs, off)) < 75_000
+    assert world.kept_ns == 0  # the loop stays
+    # Never before the planned slot, by when all of the chain has come; it moves in small steps,
+    # and, at the end of its range, by one step of the loop.
+    assert min(world.asked) >= 0 and max(world.asked) <= 24 * MS
+    steps = [abs(after - before) for before, after in pairwise(world.asked)]
+    large = [step for step in steps if step > 100_000]
+    assert all(abs(step - 10 * MS) < 200_000 for step in large)
+    assert len(large) <= 10
+
+
+def test_a_loop_that_has_no_time_left_is_late_by_no_more_than_its_work(
+    follow: Callable[..., InStep],
+) -> None:
+    """It works for 2 of 10 ms: it cannot be moved by 8 to 10, and then starts by itself."""
+    world = World(plan_in_step("loop"), -50.0, work_ns=2 * MS)
+    kept = follow(world)
+    off = run(world, kept, 900)
+    assert 1 <= world.given_back <= 20
+    late = [each for each in off[20:] if abs(each) > 75_000]
+    assert all(0 <= each <= 2 * MS + 75_000 for each in late)
+    assert len(late) < 0.35 * len(off)
+
+
+def test_a_loop_that_was_started_again_is_measured_again(follow: Callable[..., InStep]) -> None:
+    world = World(plan_in_step("loop"), 0.0)
+    kept = follow(world)
+    run(world, kept, 10)
+    before = world.kept_ns
+    world.alive = False
+    run(world, kept, 2)
+    assert not kept.has_loop and not kept.is_in_step
+    world.alive, world.first_ns, world.kept_ns = True, world.first_ns + 4 * MS, 0
+    off = run(world, kept, 10)
+    assert abs(off[-1]) < 75_000
+    assert world.kept_ns != before
+    whys = [step.why for step in kept.steps]
+    assert sum("has ended" in why for why in whys) == 1
+    assert sum("was measured" in why for why in whys) == 2
+
+
+def test_before_an_instance_in_the_next_cycle_the_output_leaves_at_the_latest(
+    follow: Callable[..., InStep],
+) -> None:
+    start = publish_slots(small_chain_plan(10 * MS, 20 * MS))[0][0]
+    world = World(plan_in_step("output", latest_ns=start + MS), 0.0)
+    kept = follow(world)
+    run(world, kept, 10)
+    assert world.moved_ns == MS and kept.is_in_step
+    assert world.off_ns() != 0
+
+
+def test_next_move_by_brute_force() -> None:
+    draw = random.Random(7)
+    for _ in range(3_000):
+        step, most = draw.randrange(2, 30), draw.randrange(60)
+        least = draw.randrange(-20, 20)
+        most += least
+        now, wanted = draw.randrange(-20, 80), draw.randrange(-90, 90)
+        fitting = [move for move in range(least, most + 1) if (move - wanted) % step == 0]
+        moved = next_move(now, wanted, step, (least, most), otherwise_ns=99)
+        if not fitting:
+            assert moved == 99
+            continue
+        assert moved in fitting
+        nearest = min(fitting, key=lambda move, now=now: abs(move - now))  # type: ignore[misc]
+        if least <= now <= most and abs(nearest - now) <= step // 2:
+            assert abs(moved - now) == abs(nearest - now)
+
+
+def test_own_starts_are_those_without_moves() -> None:
+    own = OwnStarts()
+    first = LoopMoved(100, 1, 30, 30, 0, "asked")
+    assert own.of([90, 150], [first]) == [90, 120]
+    back = LoopMoved(205, 2, 0, -30, 0, "over")
+    assert own.of([200, 210], [back]) == [170, 210]
+    assert own.of([300], []) == [300]
+
+
+def test_a_plan_that_is_in_step_does_not_follow_latencies() -> None:
+    plan = Plan.of(plan_in_step("output"))
+    assert [place for place, _, _ in loops_in_step(plan)] == [0]
+    with pytest.raises(InputError, match="in step with a loop"):
+        loops_in_step(plan, adapt=True)
+    assert not loops_in_step(Plan.of(small_chain_plan(10 * MS, 20 * MS)), adapt=True)
