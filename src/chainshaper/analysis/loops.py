@@ -15,6 +15,8 @@ sleep and wakes up (`thread_sleep`, `thread_wake`).
   as those of a thread that no sleep explains; a note says so.
 * **A named loop** (`loop_named`) may publish nothing, as one that writes to hardware. The end of
   each of its turns counts as a publication on ``NODE:end``, so that a chain can end there.
+* **The loop of ros2_control** is known without being named
+  (:mod:`~chainshaper.analysis.manager_loops`).
 
 Without events of sleeps (LTTng, eBPF, older recordings) a thread that publishes regularly counts as
 a loop whose turn begins with its publication (:func:`seems_regular`).
@@ -28,11 +30,12 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from chainshaper.analysis.manager_loops import manager_turns
 from chainshaper.analysis.matching import by_number, latest_before
 from chainshaper.analysis.objects import CALLBACK_SCHEMA, Objects, named_loops
 from chainshaper.analysis.periods import FEWEST, MOSTLY, REGULAR, roundest_period
 from chainshaper.values import events
-from chainshaper.values.application import INTERNAL_TOPICS, LOOP_END
+from chainshaper.values.application import INTERNAL_TOPICS, LOOP_END, MANAGER_WRITE
 from chainshaper.values.durations import duration_text
 from chainshaper.values.event_declarations import SLEEPING_CALLS
 
@@ -53,6 +56,7 @@ class _Loop:
     topics: tuple[str, ...]
     tids: tuple[int, ...]
     named: bool = False
+    is_manager: bool = False  # of ros2_control
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,8 @@ class FlowWithLoops:
 
     ``turns`` has a row for each instance of a loop: ``instance``, ``due`` (ns: until when the
     thread had wanted to sleep before it; null: not known), ``overran`` (whether it ended when the
-    next one should have begun; null: not known).
+    next one should have begun; null: not known), ``reads`` (ns: when it read what was stored; null:
+    at its start).
     """
 
     objects: Objects
@@ -71,7 +76,7 @@ class FlowWithLoops:
 
 
 NO_TURNS = pl.DataFrame(
-    schema={"instance": pl.UInt32, "due": pl.Int64, "overran": pl.Boolean},
+    schema={"instance": pl.UInt32, "due": pl.Int64, "overran": pl.Boolean, "reads": pl.Int64},
 )
 
 
@@ -114,6 +119,18 @@ def thread_turns(tables: events.EventTables) -> pl.DataFrame:
     return turns.with_row_index("turn")
 
 
+def _all_turns(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
+    """Return :func:`thread_turns`, where those of managers are theirs: with columns for these.
+
+    They are ``reads``, ``waits_in`` and ``manager`` (the node) of
+    :func:`~chainshaper.analysis.manager_loops.manager_turns`.
+    """
+    turns, of_managers = thread_turns(tables), manager_turns(tables, nodes)
+    turns = turns.join(of_managers.select(_THREAD).unique(), on=_THREAD, how="anti")
+    both = pl.concat([turns.drop("turn"), of_managers], how="diagonal_relaxed")
+    return both.sort("start", maintain_order=True).with_row_index("turn")
+
+
 def with_loops(
     objects: Objects, instances: pl.DataFrame, published: pl.DataFrame, tables: events.EventTables
 ) -> FlowWithLoops:
@@ -121,7 +138,7 @@ def with_loops(
 
     The new instances and publications come last.
     """
-    turns = thread_turns(tables)
+    turns = _all_turns(tables, objects.nodes)
     if turns.is_empty():
         return FlowWithLoops(objects, instances, published, NO_TURNS)
     published = _without_repeats(published, turns, instances)
@@ -140,8 +157,7 @@ def with_loops(
         instances, published = _with_first_publications(instances, published, loop, callback_id)
         if loop.named:
             published = _with_ends(published, objects, loop, of_loop, callback_id)
-        overran = (pl.col("left_ns") <= 0).fill_null(False) | _overlong(of_loop)
-        about_turns.append(of_loop.select("instance", "due", overran=overran))
+        about_turns.append(of_loop.select("instance", "due", "reads", overran=_overran(of_loop)))
     return FlowWithLoops(
         replace(
             objects,
@@ -150,7 +166,7 @@ def with_loops(
         ),
         instances,
         published,
-        pl.concat(about_turns),
+        pl.concat(about_turns, how="diagonal_relaxed"),
     )
 
 
@@ -224,9 +240,18 @@ def _named_loops(
 ) -> tuple[list[_Loop], list[str]]:
     """Find the loops that the user named, one for each thread, and say where a node has several."""
     loops, notes = list[_Loop](), list[str]()
+    of_managers = turns.drop_nulls("manager").unique(["pid", "manager", "tid"])
+    of_managers = of_managers.group_by("pid", "manager").agg(pl.col("tid").sort()).sort("pid", "tid")
+    for pid, node, tids in of_managers.iter_rows():
+        topics = outside.filter(pl.col("tid").is_in(tids), pid=pid, node=node)["topic"]
+        names = tuple(topics.cast(pl.String).unique().sort())
+        loops.append(_Loop(pid, node, names, tuple(tids), named=True, is_manager=True))
+    known = {(loop.pid, name) for loop in loops for name in (loop.node, *loop.tids)}
     named = named_loops(tables, objects.nodes).drop("valid_from").unique(maintain_order=True)
     for pid, tid, node, is_thread in named.iter_rows():
-        of_process = turns.filter(pid=pid)
+        if (pid, tid if is_thread else node) in known:
+            continue
+        of_process = turns.filter(pl.col("manager").is_null(), pid=pid)
         if is_thread:
             tids = [tid] if tid in of_process["tid"] else []
         else:
@@ -273,8 +298,10 @@ def _is_paced_by_time(turns: pl.DataFrame) -> bool:
     """Return whether turns begin when the time to sleep is over, and mostly compute.
 
     A driver may sleep for a moment and block on its device for the rest of the time: then it
-    neither computes nor sleeps during most of its period.
+    neither computes nor sleeps during most of its period. What is known by name needs no evidence.
     """
+    if turns["manager"].count():
+        return True
     waited = turns.sort("start").select(
         blocked=(pl.col("end") - pl.col("start") - pl.col("execution_ns")).median(),
         period=pl.col("start").diff().median(),
@@ -306,6 +333,8 @@ def _turns_of(
 ) -> pl.DataFrame:
     """Select the turns of a loop: all of its threads, unless the node has several loops there."""
     chosen = turns.filter(pl.col("tid").is_in(loop.tids), pid=loop.pid)
+    if loop.is_manager:
+        return chosen.filter(manager=loop.node)
     shared = [
         sibling
         for sibling in loops
@@ -390,14 +419,27 @@ def _with_ends(
     published: pl.DataFrame, objects: Objects, loop: _Loop, turns: pl.DataFrame, callback_id: int
 ) -> pl.DataFrame:
     """Add a publication on ``NODE:end`` at the end of each of a named loop's turns."""
-    ends = objects.publishers.filter(
-        pl.col("topic") == loop.node + LOOP_END, pl.col("pid") == loop.pid
-    ).select("publisher", "node", "topic")
+    topic = loop.node + (MANAGER_WRITE if loop.is_manager else LOOP_END)
+    ends = objects.publishers.filter(pl.col("topic") == topic, pl.col("pid") == loop.pid)
+    ends = ends.select("publisher", "node", "topic")
     rows = turns.drop_nulls("end").select(
         *("instance", *_THREAD), time="end", callback_id=pl.lit(callback_id, pl.UInt32)
     )
     rows = rows.join(ends.head(1), how="cross").with_row_index("publication", published.height)
     return pl.concat([published, rows], how="diagonal")
+
+
+def _overran(turns: pl.DataFrame) -> pl.Expr:
+    """Whether a turn ended when the next one should have begun; null: its device paces the loop.
+
+    A controller manager that was late moves the time to which it sleeps behind its end.
+    """
+    overran = (pl.col("left_ns") <= 0).fill_null(False) | _overlong(turns)
+    if not turns["manager"].count():
+        return overran
+    period = regular_period(turns["start"].sort().to_numpy())
+    too_late = pl.lit(False) if period is None else pl.col("end") >= pl.col("due") + period
+    return pl.when(pl.col("waits_in").is_null()).then(overran | too_late.fill_null(False))
 
 
 def _overlong(turns: pl.DataFrame) -> pl.Expr:
@@ -433,7 +475,13 @@ def seems_regular(times: npt.NDArray[np.int64]) -> bool:
 
 
 def _notes(loop: _Loop, turns: pl.DataFrame) -> Iterator[str]:
-    """Say where a loop has no period."""
+    """Say where a loop has no period, and where its device paces it."""
+    if (waits_in := turns["waits_in"].first()) is not None:
+        yield (
+            f"the loop of {loop.node} waits for its device in {waits_in}(), so its period is the"
+            " device's, and no event says when a turn was due: overruns and jitter of start are not"
+            f" known{'; a turn begins when read() returns' if waits_in == 'read' else ''}."
+        )
     starts = turns["start"].sort().to_numpy()
     if len(starts) < 3 or _is_regular(starts):
         return
