@@ -349,10 +349,6 @@ def _turns_of(
 
 def _callback(callback_id: int, loop: _Loop, turns: pl.DataFrame) -> pl.DataFrame:
     """Make the row of a loop among callbacks."""
-    period = regular_period(turns["start"].sort().to_numpy())
-    due = turns["due"].drop_nulls().sort().to_numpy()
-    if period is not None and due.size == turns.height:  # more exact than when it woke up
-        period = regular_period(due) or period
     row = {
         "callback_id": callback_id,
         "pid": loop.pid,
@@ -360,7 +356,7 @@ def _callback(callback_id: int, loop: _Loop, turns: pl.DataFrame) -> pl.DataFram
         "valid_from": turns["start"].min(),
         "kind": "loop",
         "node": loop.node,
-        "period_ns": period,
+        "period_ns": _period(turns),
         "observed": False,
     }
     return pl.DataFrame([row | dict.fromkeys(CALLBACK_SCHEMA.keys() - row)], CALLBACK_SCHEMA)
@@ -437,9 +433,40 @@ def _overran(turns: pl.DataFrame) -> pl.Expr:
     overran = (pl.col("left_ns") <= 0).fill_null(False) | _overlong(turns)
     if not turns["manager"].count():
         return overran
-    period = regular_period(turns["start"].sort().to_numpy())
+    period = _period(turns)
     too_late = pl.lit(False) if period is None else pl.col("end") >= pl.col("due") + period
     return pl.when(pl.col("waits_in").is_null()).then(overran | too_late.fill_null(False))
+
+
+def _period(turns: pl.DataFrame) -> int | None:
+    """Return the period of a loop (ns); None: it has none.
+
+    Times to sleep are more exact than when it woke up.
+    """
+    period = regular_period(turns["start"].sort().to_numpy())
+    due = turns["due"].drop_nulls().sort().to_numpy()
+    if turns["manager"].count():
+        return _grid(due) or period
+    if period is not None and due.size == turns.height:
+        return regular_period(due) or period
+    return period
+
+
+def _grid(due: npt.NDArray[np.int64]) -> int | None:
+    """Return the period (ns) of which times to sleep are a multiple apart; None: of none.
+
+    A controller manager that is late leaves periods out.
+    """
+    apart = np.diff(due)
+    if len(apart) < 2:
+        return None
+    unit = float(np.percentile(apart, 10))
+    usual = apart[np.abs(apart - unit) <= REGULAR * unit]
+    multiples = apart / max(unit, 1.0)
+    on_grid = (np.abs(multiples - np.round(multiples)) <= REGULAR) & (multiples > 0.5)
+    if not len(usual) or float(np.mean(on_grid)) < MOSTLY:
+        return None
+    return roundest_period(usual, float(np.median(usual)))
 
 
 def _overlong(turns: pl.DataFrame) -> pl.Expr:

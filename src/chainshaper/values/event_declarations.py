@@ -585,7 +585,7 @@ _OURS = (
     Event(
         "controller_manager_found",
         "creation",
-        (EventField("manager", "address", 0), EventField("name", "text", 1)),  # null: not known
+        (EventField("manager", "address", 0), EventField("name", "text", 1)),  # empty: not known
         recorded_by_library="arguments",
     ),
     # A function of it returned. The tracing library emits it, which stands in front of the three.

@@ -39,7 +39,7 @@ static int storing, message, sensor_writer, sensor_publisher;
 static const uint8_t gid[24] = {1};
 static std::atomic<bool> over;
 
-static void create() {
+static void create(int64_t sensor_period) {
   ros_trace_rcl_init(&manager_node);
   ros_trace_rcl_node_init(&sensor_node, &sensor_node, "sensor", "/");
   ros_trace_rcl_node_init(&manager_node, &manager_node, "controller_manager", "/");
@@ -50,13 +50,13 @@ static void create() {
   ros_trace_rcl_subscription_init(&subscription, &controller_node, &reader, "/commands", 7);
   ros_trace_rclcpp_subscription_init(&subscription, &reader);
   ros_trace_rclcpp_subscription_callback_added(&reader, &storing);
-  ros_trace_rcl_timer_init(&timer, 7000000);
+  ros_trace_rcl_timer_init(&timer, sensor_period);
   ros_trace_rclcpp_timer_callback_added(&timer, &timer_callback);
   ros_trace_rclcpp_timer_link_node(&timer, &sensor_node);
 }
 
-static void sense(controller_manager::ControllerManager & manager) {
-  for (int64_t next = now(); !over; next += 7000000) {
+static void sense(controller_manager::ControllerManager & manager, int64_t period) {
+  for (int64_t next = now(); !over; next += period) {
     sleep_until(next);
     ros_trace_callback_start(&timer_callback, false);
     const int64_t stamp = clock_ns(CLOCK_REALTIME);
@@ -76,22 +76,23 @@ static void sense(controller_manager::ControllerManager & manager) {
   }
 }
 
-int main(int count, char ** words) {
+extern "C" int run_node(int count, char ** words) {
   if (count != 4) return 2;
   const int turns = std::atoi(words[1]);
   const int64_t period = std::atoll(words[2]) * 1000;
   const bool blocks = !std::strcmp(words[3], "blocks"), busy = !std::strcmp(words[3], "busy");
   const bool writing = !std::strcmp(words[3], "blocks writing");
   const bool throws = !std::strcmp(words[3], "throws");
-  create();
+  const int64_t sensor_period = blocks ? 3 * period / 2 : 3 * period / 4;
+  create(sensor_period);
   controller_manager::ControllerManager manager("/controller_manager");
-  std::thread sensor(sense, std::ref(manager));
+  std::thread sensor(sense, std::ref(manager), sensor_period);
   std::thread loop([&] {
     int64_t next = now() + period;
     sleep_until(next);
     for (int turn = 0; turn < turns; turn++) {
-      manager.device_ns = blocks ? next + period : 0;
-      manager.writing_ns = writing ? next + period : 0;
+      manager.device_ns = blocks ? now() + period : 0;
+      manager.writing_ns = writing ? now() + period : 0;
       manager.throws = throws && turn % 10 == 9;
       const rclcpp::Time time{turn};
       const rclcpp::Duration duration{period};
@@ -133,3 +134,7 @@ int main(int count, char ** words) {
   sensor.join();
   return 0;
 }
+
+#ifndef PLUGIN
+int main(int count, char ** words) { return run_node(count, words); }
+#endif

@@ -905,7 +905,7 @@ int rmw_wait(void *subscriptions, void *conditions, void *services, void *client
 // and a `const rclcpp::Duration &`. `update` returns an enumeration of a byte, the others nothing:
 // the register goes through as it is. They may throw: this file is compiled so that exceptions pass.
 #define OF_MANAGER(name) _ZN18controller_manager17ControllerManager##name##ERKN6rclcpp4TimeERKNS1_8DurationE
-#define NAME_OF_NODE "_ZNK6rclcpp4Node28get_fully_qualified_nameEv"
+#define NAME_OF_NODE "_ZNK6rclcpp4Node24get_fully_qualified_nameEv"
 #define TEXT_OF(name) #name
 #define AS_TEXT(name) TEXT_OF(name)
 
