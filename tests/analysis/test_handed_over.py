@@ -21,9 +21,7 @@ def flow_of(story: Story, *through: str) -> DataFlow:
 SENT, ACTED = (1000, 1040, 1100, 1200), (1030, 1130, 1210, 1230)
 
 
-def hidden(
-    sent: tuple[int, ...] = SENT, acted: tuple[int, ...] = ACTED, unit: int = 1
-) -> Story:
+def hidden(sent: tuple[int, ...] = SENT, acted: tuple[int, ...] = ACTED, unit: int = 1) -> Story:
     """/sensor sends /a; /filter stores it and publishes /debug, and a timer of /actor, in the same
     process, publishes /cmd from it. Since /filter publishes, nothing shows that it stores as well.
     Times are in ``unit`` ns.
@@ -156,7 +154,7 @@ def test_a_plan_is_made_from_it(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "regular", story.tables(), info).path
     planned = json_of("plan", path, "--chain", "/a../cmd", "--through", "/a=/cmd")
     assert planned["cycle_ns"] == 100_000_000
-    assert planned["longest_latency_ns"] == 35_000_000
+    assert planned["bands_ns"][0] > 35_000_000, "the slot lies behind the longest latency"
     assert "no path leads" in refused(2, "plan", path, "--chain", "/a../cmd")
 
 

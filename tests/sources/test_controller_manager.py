@@ -67,7 +67,7 @@ def compiled(folder: Path, *flags: str, plugin: bool = False) -> list[str]:
     shared = ["-shared", "-fPIC"]
     subprocess.run([*gcc, *shared, SOURCES / "controller_manager.cpp", "-o", library], check=True)
     kind = [*shared, "-DPLUGIN"] if plugin else []
-    linked = [library, tracetools, f"-Wl,-rpath,{folder}:{tracetools.parent}", "-pthread"]
+    linked = [str(library), str(tracetools), f"-Wl,-rpath,{folder}:{tracetools.parent}", "-pthread"]
     including = f"-I{SOURCES.parent / 'tracetools'}"
     source = SOURCES / "ros2_control_node.cpp"
     subprocess.run([*gcc, *kind, including, source, *linked, "-o", program], check=True)
@@ -84,9 +84,7 @@ def node(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     return compiled(tmp_path_factory.mktemp("ros2_control"))
 
 
-def run(
-    command: list[str], folder: Path, how: str = "sleeps", loops: tuple[str, ...] = ()
-) -> Run:
+def run(command: list[str], folder: Path, how: str = "sleeps", loops: tuple[str, ...] = ()) -> Run:
     words = [*command, str(TURNS), str(PERIOD_NS // 1000), how]
 
     def start() -> list[list[str]]:
@@ -120,7 +118,7 @@ def test_every_turn_is_seen_with_its_three_calls(sleeping: Run) -> None:
         assert (of_function["began"] >= noted[begins]).all()
         assert (of_function["time"] <= noted[ends]).all()
         computed = of_function["thread_time"] - of_function["thread_time_began"]
-        assert float(computed.median()) >= 90_000, "each computes for 100 µs"  # type: ignore[arg-type]
+        assert float(computed.median()) >= 90_000, "each computes for 100 µs"
     found = sleeping.tables["controller_manager_found"]
     assert found["name"].to_list() == ["/controller_manager"]
 
@@ -130,7 +128,7 @@ def test_the_turns_are_the_loop_of_the_node(sleeping: Run) -> None:
     assert turns.height == TURNS
     for column, earliest, latest in (("start", "read", "returned"), ("end", "update", "written")):
         assert (turns[column] >= noted[earliest]).all() and (turns[column] <= noted[latest]).all()
-    assert float(turns["execution_ns"].median()) >= 280_000  # type: ignore[arg-type]
+    assert float(turns["execution_ns"].median()) >= 280_000
     # From the second turn on it slept before: until when it was due, as the process has it.
     assert turns["due"][1:].to_list() == noted["due_next"][:-1].to_list()
     (loop,) = callback_statistics(sleeping.flow).filter(kind="loop").iter_rows(named=True)

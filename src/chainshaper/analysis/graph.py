@@ -17,8 +17,8 @@ callback and published in another of the same node:
 * **What the user declares** (`--through`): messages of a topic go into another topic's, which any
   callback of the same process publishes.
 
-All of these but the last are inferences. A topic that only another callback publishes for this one stands in
-``Callback.publishes`` and also in ``passes_on``.
+All of these but the last are inferences. A topic that only another callback publishes for this one
+stands in ``Callback.publishes`` and also in ``passes_on``.
 """
 
 from collections import defaultdict

@@ -241,7 +241,9 @@ def _named_loops(
     """Find the loops that the user named, one for each thread, and say where a node has several."""
     loops, notes = list[_Loop](), list[str]()
     of_managers = turns.drop_nulls("manager").unique(["pid", "manager", "tid"])
-    of_managers = of_managers.group_by("pid", "manager").agg(pl.col("tid").sort()).sort("pid", "tid")
+    of_managers = (
+        of_managers.group_by("pid", "manager").agg(pl.col("tid").sort()).sort("pid", "tid")
+    )
     for pid, node, tids in of_managers.iter_rows():
         topics = outside.filter(pl.col("tid").is_in(tids), pid=pid, node=node)["topic"]
         names = tuple(topics.cast(pl.String).unique().sort())
@@ -503,7 +505,7 @@ def seems_regular(times: npt.NDArray[np.int64]) -> bool:
 
 def _notes(loop: _Loop, turns: pl.DataFrame) -> Iterator[str]:
     """Say where a loop has no period, and where its device paces it."""
-    if (waits_in := turns["waits_in"].first()) is not None:
+    if isinstance(waits_in := turns["waits_in"].first(), str):
         yield (
             f"the loop of {loop.node} waits for its device in {waits_in}(), so its period is the"
             " device's, and no event says when a turn was due: overruns and jitter of start are not"

@@ -45,7 +45,10 @@ def managers(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
 
 
 def manager_ends(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
-    """Make a frame of the ends of managers' turns as publishers: ``pid, node, valid_from, topic``."""
+    """Make a frame of the ends of managers' turns as publishers.
+
+    Columns: ``pid, node, valid_from, topic``.
+    """
     found = managers(tables, nodes).select("pid", "node", "valid_from")
     found = found.unique(["pid", "node"], keep="first", maintain_order=True)
     return found.with_columns(topic=pl.col("node") + MANAGER_WRITE)
@@ -113,7 +116,10 @@ def _waits_in(key: list[str]) -> pl.Expr:
 
 
 def _with_sleeps(turns: pl.DataFrame, tables: events.EventTables) -> pl.DataFrame:
-    """Add ``due``, ``wanted_ns``, ``left_ns`` and ``call`` to turns that are sorted by ``began``."""
+    """Add what is known of the sleeps before and behind turns, which are sorted by ``began``.
+
+    Columns: ``due``, ``wanted_ns``, ``left_ns``, ``call``.
+    """
     slept = events.table(tables, "thread_sleep").select(
         *_THREAD, "call", slept="time", until=pl.when(pl.col("until") > 0).then("until")
     )
@@ -130,7 +136,9 @@ def _with_sleeps(turns: pl.DataFrame, tables: events.EventTables) -> pl.DataFram
     ).drop("slept", "until")
     later = slept.rename({"call": "call_behind"})
     turns = first_after(turns, later, _THREAD, "end", "slept")
-    sleeps_behind = (pl.col("slept") < pl.col("begins_next")).fill_null(pl.col("slept").is_not_null())
+    sleeps_behind = (pl.col("slept") < pl.col("begins_next")).fill_null(
+        pl.col("slept").is_not_null()
+    )
     left = (
         pl.when(sleeps_behind)
         .then(pl.col("until") - pl.col("slept"))

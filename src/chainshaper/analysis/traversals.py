@@ -290,7 +290,7 @@ def _publish_by_sibling(
     state = state.with_columns(
         pl.coalesce(publication, later), (pl.col(sibling) | later.is_not_null()).alias(sibling)
     )
-    stores = MESSAGE_FILTER not in (callback.symbol or MESSAGE_FILTER) or loops
+    stores = MESSAGE_FILTER not in (callback.symbol or MESSAGE_FILTER) or bool(loops)
     stores = stores or (callback.topic, topic) in flow.through
     if callback.kind == "service" or stores:
         return state, []  # a callback that stores its latest message: old values are its purpose

@@ -23,7 +23,7 @@ REQUEST, RESPONSE = ":request", ":response"
 LOOP_END = ":end"
 """Ending of a node's name: the end of each instance of its named loop counts as a message there."""
 MANAGER_WRITE = ":write"
-"""Ending of a controller manager's name (ros2_control): that its `write()` returned counts so, too."""
+"""Ending of a controller manager's name (ros2_control): that `write()` returned counts so, too."""
 LOOP_ENDS = (LOOP_END, MANAGER_WRITE)
 CallbackKind: TypeAlias = Literal["timer", "subscription", "service", "client", "loop", "unknown"]
 """What starts a callback.

@@ -1,5 +1,5 @@
 // ros2_control's controller manager as the tracing library sees it: the names that the compiler gives
-// its functions are those of ros2_control 2.52 to 6.8, and it is a node of rclcpp.
+// its functions are those of ros2_control 2.8 to 6.8, and it is a node of rclcpp.
 #pragma once
 #include <cstdint>
 #include <mutex>

@@ -43,7 +43,7 @@
 // Upstream: `tracetools/tracetools.h` of ros2_tracing, tags 4.1.1 to 8.10.1: all arguments are
 // integers or pointers, at most five, so functions of all versions can be called in the same way.
 // rmw, `rmw/types.h` and `rmw/rmw.h`, Humble to Rolling: `rmw_service_info_t`, `rmw_request_id_t`.
-// ros2_control, `controller_manager/controller_manager.hpp`, 2.52.0 (Humble), 4.0.0 to 4.46.0, 6.8.0.
+// ros2_control, `controller_manager/controller_manager.hpp`, 2.8.0 (Humble) to 6.8.0.
 #define _GNU_SOURCE
 #undef _FORTIFY_SOURCE  // with it headers define some of the functions that we stand in front of
 #include <dlfcn.h>
