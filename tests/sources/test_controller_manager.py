@@ -118,7 +118,8 @@ def test_every_turn_is_seen_with_its_three_calls(sleeping: Run) -> None:
         assert (of_function["began"] >= noted[begins]).all()
         assert (of_function["time"] <= noted[ends]).all()
         computed = of_function["thread_time"] - of_function["thread_time_began"]
-        assert float(computed.median()) >= 90_000, "each computes for 100 µs"
+        computes = (computed >= 90_000).sum()  # the clock is read again in some turns only
+        assert computes > TURNS // 2, "each computes for 100 µs"
     found = sleeping.tables["controller_manager_found"]
     assert found["name"].to_list() == ["/controller_manager"]
 
@@ -128,7 +129,7 @@ def test_the_turns_are_the_loop_of_the_node(sleeping: Run) -> None:
     assert turns.height == TURNS
     for column, earliest, latest in (("start", "read", "returned"), ("end", "update", "written")):
         assert (turns[column] >= noted[earliest]).all() and (turns[column] <= noted[latest]).all()
-    assert float(turns["execution_ns"].median()) >= 280_000
+    assert (turns["execution_ns"] >= 280_000).sum() > TURNS // 2
     # From the second turn on it slept before: until when it was due, as the process has it.
     assert turns["due"][1:].to_list() == noted["due_next"][:-1].to_list()
     (loop,) = callback_statistics(sleeping.flow).filter(kind="loop").iter_rows(named=True)
