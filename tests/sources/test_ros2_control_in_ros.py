@@ -120,6 +120,7 @@ def test_every_turn_of_ros2_control_is_seen_and_ends_the_chain(
     )
     turns = flow.instances.filter(callback_id=loop.id).sort("start")
     assert loop.period_ns == 10_000_000
+    assert [c.node for c in callbacks if c.kind == "loop" and c.pid == loop.pid] == [loop.node]
     assert turns.height == len(rows), "turns seen of turns made"
     ended = turns["end"].to_list()
     assert all(end >= returned for end, (_, returned) in zip(ended, rows, strict=True))

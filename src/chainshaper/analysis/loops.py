@@ -203,8 +203,12 @@ def _without_repeats(
 
 
 def _outside(published: pl.DataFrame, turns: pl.DataFrame) -> pl.DataFrame:
-    """Select the publications in turns that no callback made, with the number of their turn."""
-    internal = pl.col("topic").cast(pl.String).is_in(sorted(INTERNAL_TOPICS))
+    """Select the publications in turns that no callback made, with the number of their turn.
+
+    That a lifecycle node changes its state is none: ros2_control's loop activates controllers.
+    """
+    topic = pl.col("topic").cast(pl.String)
+    internal = topic.is_in(sorted(INTERNAL_TOPICS)) | topic.str.ends_with("/transition_event")
     outside = pl.col("instance").is_null() & ~internal & pl.col("node").is_not_null()
     return _placed(published.filter(outside), turns)
 
