@@ -25,6 +25,7 @@ from typing import TypeAlias, TypeVar
 from chainshaper.values.application import (
     INTERNAL_TOPICS,
     LOOP_END,
+    MANAGER_WRITE,
     REQUEST,
     RESPONSE,
     ApplicationGraph,
@@ -279,6 +280,10 @@ class _Search:
                 services.add(callback.topic)
             nodes.setdefault(callback.node, set()).add(callback.id)
             topics.update(callback.publishes)
+        if name.endswith(LOOP_END) and name not in topics:  # that of a controller manager
+            name_of_node = name.removesuffix(LOOP_END)
+            written = {name_of_node + MANAGER_WRITE, f"/{name_of_node}{MANAGER_WRITE}"} & topics
+            name = min(written, default=name)
         for candidate in (name, f"/{name}"):
             if candidate in topics:
                 return candidate, frozenset[Vertex]((candidate,))

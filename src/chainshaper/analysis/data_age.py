@@ -25,7 +25,7 @@ import polars as pl
 
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.graph import readers
-from chainshaper.analysis.traversals import Traversals, traverse
+from chainshaper.analysis.traversals import Traversals, reading_instants, traverse
 from chainshaper.values.application import ApplicationGraph, Callback, Chain
 
 _NEVER = 1 << 62  # ns
@@ -128,7 +128,8 @@ def _ages_at(
         pl.col("instance").is_not_null(), callback_id=loop.id, topic=topic
     ).select("publication", "instance", "time", publish="sent")
     start = pl.lit(flow.instances["start"]).gather("instance")
-    outputs = outputs.with_columns(start=start).sort("time", maintain_order=True)
+    reads = pl.lit(reading_instants(flow)).gather("instance")
+    outputs = outputs.with_columns(start=start, reads=reads).sort("time", maintain_order=True)
     outputs = outputs.with_columns(ambiguous=_ambiguous(flow, outputs, messages["instance"]))
     # What is published without a new message repeats the one before.
     first_uses = messages.drop("instance").drop_nulls("publication")
@@ -140,7 +141,7 @@ def _ages_at(
         how="left",
         maintain_order="left",
     )
-    read = pl.max_horizontal("start", "stored")
+    read = pl.max_horizontal("reads", "stored")
     cycles = used.select(
         "start",
         "publish",

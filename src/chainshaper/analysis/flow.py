@@ -91,6 +91,9 @@ class DataFlow:
     ``followed``
         The frame of :func:`~chainshaper.analysis.restarts.followed_processes`. The callbacks of a
         node that was started again have one ``callback_id`` in all frames.
+    ``through``
+        What the user declared that no event shows: pairs of topics, of which the first one's
+        messages go into publications on the second (:mod:`~chainshaper.values.handed_over`).
     """
 
     objects: Objects
@@ -103,12 +106,14 @@ class DataFlow:
     without_takes: frozenset[int] = frozenset()
     turns: pl.DataFrame = field(default_factory=NO_TURNS.clear)
     followed: pl.DataFrame = field(default_factory=FOLLOWED.to_frame)
+    through: tuple[tuple[str, str], ...] = ()
 
 
 def recorded_flow(recording: Recording) -> DataFlow:
     """Resolve the events of a recording, with its clock offset and its count of lost events."""
     info = recording.info
-    return data_flow(recording.events, info.clock_offset_ns, complete=not any(info.lost.values()))
+    flow = data_flow(recording.events, info.clock_offset_ns, complete=not any(info.lost.values()))
+    return replace(flow, through=info.through) if info.through else flow
 
 
 def _let_go(tables: events.EventTables, names: Collection[str]) -> None:

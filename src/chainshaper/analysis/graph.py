@@ -14,13 +14,15 @@ callback and published in another of the same node:
 * **Stored messages**: in a node whose subscription callbacks publish nothing at all, but whose
   timers or loops do, a subscription callback stores its message for these. A loop that the user
   named also reads what such callbacks of other nodes of its process stored.
+* **What the user declares** (`--through`): messages of a topic go into another topic's, which any
+  callback of the same process publishes.
 
-All of these are inferences. A topic that only another callback publishes for this one stands in
-``Callback.publishes`` and also in ``passes_on``.
+All of these but the last are inferences. A topic that only another callback publishes for this one
+stands in ``Callback.publishes`` and also in ``passes_on``.
 """
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,11 +33,13 @@ from chainshaper.analysis.objects import endpoints
 from chainshaper.values import events
 from chainshaper.values.application import (
     INTERNAL_TOPICS,
-    LOOP_END,
+    LOOP_ENDS,
     ApplicationGraph,
     Callback,
     Node,
 )
+from chainshaper.values.close_names import close_names
+from chainshaper.values.errors import InputError
 
 MESSAGE_FILTER = "message_filters::"
 """This stands in the symbols of callbacks that message_filters registered."""
@@ -74,12 +78,13 @@ def graph_of(flow: DataFlow) -> ApplicationGraph:
     for callback in callbacks:
         if is_named_loop(callback):
             named_loops[callback.pid].append(callback)
+    handed = _handed_over(callbacks, flow)
     created = flow.objects.nodes.select("node", "pid").unique(maintain_order=True).iter_rows()
     nodes = dict.fromkeys((node, last.get((node, pid), pid)) for node, pid in created)
     complete = []
     for callback in callbacks:
         siblings = of_node[callback.pid, callback.node]
-        passed = _passed_on(callback, siblings, named_loops[callback.pid])
+        passed = _passed_on(callback, siblings, named_loops[callback.pid]) | handed[callback.id]
         sets = ({*callback.publishes, *passed}, passed, turns[callback.id])
         publishes, passes_on, in_turns = (tuple(sorted(topics)) for topics in sets)
         complete.append(
@@ -90,16 +95,67 @@ def graph_of(flow: DataFlow) -> ApplicationGraph:
         callbacks=tuple(complete),
         publishers=_by_topic(flow.objects.publishers),
         subscribers=_by_topic(flow.objects.subscriptions),
+        through=flow.through,
     )
 
 
+def _handed_over(callbacks: Sequence[Callback], flow: DataFlow) -> dict[int, set[str]]:
+    """Map callbacks to the topics into which their messages go as the user declared.
+
+    ``callbacks`` publish what their own instances did. Raises InputError: what was declared cannot
+    be, since a topic is not there, or nobody in a process has both.
+    """
+    handed = defaultdict[int, set[str]](set)
+    for read, written in flow.through:
+        declared = f"--through {read}={written}"
+        for topic, ends in ((read, flow.objects.subscriptions), (written, flow.objects.publishers)):
+            known = {*ends["topic"].cast(pl.String).drop_nulls()} - INTERNAL_TOPICS
+            if topic not in known:
+                doing = "reads" if topic == read else "publishes"
+                close = close_names(topic, known)
+                remedy = f"did you mean {' or '.join(close)}?" if close else "see `graph`"
+                raise InputError(f"{declared}: no node of the recording {doing} {topic}; {remedy}")
+        readers_of = [c for c in callbacks if c.kind == "subscription" and c.topic == read]
+        writers = [c for c in callbacks if written in c.publishes]
+        for callback in readers_of:
+            if any(w.pid == callback.pid and w.id != callback.id for w in writers):
+                handed[callback.id].add(written)
+        if readers_of and writers and not any(written in handed[c.id] for c in readers_of):
+            ways = [
+                ", ".join(sorted({f"{c.node} (process {c.pid})" for c in ends}))
+                for ends in (readers_of, writers)
+            ]
+            raise InputError(
+                f"{declared}: {ways[0]} reads {read}, {ways[1]} publishes {written}, and these are"
+                " not in one process, or one callback does both: what a callback publishes itself"
+                " needs no declaration, and what goes from process to process is a message; name"
+                " the topic in between, or the nodes of one process"
+            )
+    return handed
+
+
 def is_named_loop(callback: Callback) -> bool:
-    """Return whether a callback is a loop that the user named: its instances' ends are messages."""
-    return callback.kind == "loop" and callback.node + LOOP_END in callback.publishes
+    """Return whether a callback is a loop that is known by name: its instances' ends are messages.
+
+    The user named it, or it is a controller manager of ros2_control.
+    """
+    ends = {callback.node + ending for ending in LOOP_ENDS}
+    return callback.kind == "loop" and not ends.isdisjoint(callback.publishes)
 
 
 def readers(graph: ApplicationGraph, callback: Callback, topic: str) -> list[Callback]:
-    """Return the timers and loops that publish ``topic`` from what ``callback`` stored."""
+    """Return the timers and loops that publish ``topic`` from what ``callback`` stored.
+
+    Where the user declared that its messages go there, it is whatever callback publishes it.
+    """
+    if (callback.topic, topic) in graph.through:
+        return [
+            reader
+            for reader in graph.callbacks
+            if topic in {*reader.publishes} - {*reader.passes_on}
+            and reader.pid == callback.pid
+            and reader.id != callback.id
+        ]
     return [
         reader
         for reader in graph.callbacks

@@ -16,6 +16,8 @@ sleep and wakes up (`thread_sleep`, `thread_wake`).
   as those of a thread that no sleep explains; a note says so.
 * **A named loop** (`loop_named`) may publish nothing, as one that writes to hardware. The end of
   each of its turns counts as a publication on ``NODE:end``, so that a chain can end there.
+* **The loop of ros2_control** is known without being named
+  (:mod:`~chainshaper.analysis.manager_loops`).
 
 Without events of sleeps (LTTng, eBPF, older recordings) a thread that publishes regularly counts as
 a loop whose turn begins with its publication (:func:`seems_regular`).
@@ -29,11 +31,12 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from chainshaper.analysis.manager_loops import manager_turns
 from chainshaper.analysis.matching import by_number, latest_before
 from chainshaper.analysis.objects import CALLBACK_SCHEMA, Objects, named_loops
 from chainshaper.analysis.periods import FEWEST, MOSTLY, REGULAR, roundest_period
 from chainshaper.values import events
-from chainshaper.values.application import INTERNAL_TOPICS, LOOP_END
+from chainshaper.values.application import INTERNAL_TOPICS, LOOP_END, MANAGER_WRITE
 from chainshaper.values.durations import duration_text
 from chainshaper.values.event_declarations import SLEEPING_CALLS
 
@@ -58,6 +61,7 @@ class _Loop:
     topics: tuple[str, ...]
     tids: tuple[int, ...]
     named: bool = False
+    is_manager: bool = False  # of ros2_control
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,8 @@ class FlowWithLoops:
 
     ``turns`` has a row for each instance of a loop: ``instance``, ``due`` (ns: until when the
     thread had wanted to sleep before it; null: not known), ``overran`` (whether it ended when the
-    next one should have begun; null: not known).
+    next one should have begun; null: not known), ``reads`` (ns: when it read what was stored; null:
+    at its start).
     """
 
     objects: Objects
@@ -76,7 +81,7 @@ class FlowWithLoops:
 
 
 NO_TURNS = pl.DataFrame(
-    schema={"instance": pl.UInt32, "due": pl.Int64, "overran": pl.Boolean},
+    schema={"instance": pl.UInt32, "due": pl.Int64, "overran": pl.Boolean, "reads": pl.Int64},
 )
 
 
@@ -124,6 +129,18 @@ def thread_turns(tables: events.EventTables) -> pl.DataFrame:
     return turns.with_row_index("turn")
 
 
+def _all_turns(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
+    """Return :func:`thread_turns`, where those of managers are theirs: with columns for these.
+
+    They are ``reads``, ``waits_in`` and ``manager`` (the node) of
+    :func:`~chainshaper.analysis.manager_loops.manager_turns`.
+    """
+    turns, of_managers = thread_turns(tables), manager_turns(tables, nodes)
+    turns = turns.join(of_managers.select(_THREAD).unique(), on=_THREAD, how="anti")
+    both = pl.concat([turns.drop("turn"), of_managers], how="diagonal_relaxed")
+    return both.sort("start", maintain_order=True).with_row_index("turn")
+
+
 def with_loops(
     objects: Objects, instances: pl.DataFrame, published: pl.DataFrame, tables: events.EventTables
 ) -> FlowWithLoops:
@@ -131,7 +148,7 @@ def with_loops(
 
     The new instances and publications come last.
     """
-    turns = thread_turns(tables)
+    turns = _all_turns(tables, objects.nodes)
     if turns.is_empty():
         return FlowWithLoops(objects, instances, published, NO_TURNS)
     published = _without_repeats(published, turns, instances)
@@ -150,8 +167,7 @@ def with_loops(
         instances, published = _with_first_publications(instances, published, loop, callback_id)
         if loop.named:
             published = _with_ends(published, objects, loop, of_loop, callback_id)
-        overran = (pl.col("left_ns") <= 0).fill_null(False) | _overlong(of_loop)
-        about_turns.append(of_loop.select("instance", "due", overran=overran))
+        about_turns.append(of_loop.select("instance", "due", "reads", overran=_overran(of_loop)))
     return FlowWithLoops(
         replace(
             objects,
@@ -160,7 +176,7 @@ def with_loops(
         ),
         instances,
         published,
-        pl.concat(about_turns),
+        pl.concat(about_turns, how="diagonal_relaxed"),
     )
 
 
@@ -197,8 +213,12 @@ def _without_repeats(
 
 
 def _outside(published: pl.DataFrame, turns: pl.DataFrame) -> pl.DataFrame:
-    """Select the publications in turns that no callback made, with the number of their turn."""
-    internal = pl.col("topic").cast(pl.String).is_in(sorted(INTERNAL_TOPICS))
+    """Select the publications in turns that no callback made, with the number of their turn.
+
+    That a lifecycle node changes its state is none: ros2_control's loop activates controllers.
+    """
+    topic = pl.col("topic").cast(pl.String)
+    internal = topic.is_in(sorted(INTERNAL_TOPICS)) | topic.str.ends_with("/transition_event")
     outside = pl.col("instance").is_null() & ~internal & pl.col("node").is_not_null()
     return _placed(published.filter(outside), turns)
 
@@ -234,9 +254,20 @@ def _named_loops(
 ) -> tuple[list[_Loop], list[str]]:
     """Find the loops that the user named, one for each thread, and say where a node has several."""
     loops, notes = list[_Loop](), list[str]()
+    of_managers = turns.drop_nulls("manager").unique(["pid", "manager", "tid"])
+    of_managers = (
+        of_managers.group_by("pid", "manager").agg(pl.col("tid").sort()).sort("pid", "tid")
+    )
+    for pid, node, tids in of_managers.iter_rows():
+        topics = outside.filter(pl.col("tid").is_in(tids), pid=pid, node=node)["topic"]
+        names = tuple(topics.cast(pl.String).unique().sort())
+        loops.append(_Loop(pid, node, names, tuple(tids), named=True, is_manager=True))
+    known = {(loop.pid, name) for loop in loops for name in (loop.node, *loop.tids)}
     named = named_loops(tables, objects.nodes).drop("valid_from").unique(maintain_order=True)
     for pid, tid, node, is_thread in named.iter_rows():
-        of_process = turns.filter(pid=pid)
+        if (pid, tid if is_thread else node) in known:
+            continue
+        of_process = turns.filter(pl.col("manager").is_null(), pid=pid)
         if is_thread:
             tids = [tid] if tid in of_process["tid"] else []
         else:
@@ -283,8 +314,10 @@ def _is_paced_by_time(turns: pl.DataFrame) -> bool:
     """Return whether turns begin when the time to sleep is over, and mostly compute.
 
     A driver may sleep for a moment and block on its device for the rest of the time: then it
-    neither computes nor sleeps during most of its period.
+    neither computes nor sleeps during most of its period. What is known by name needs no evidence.
     """
+    if turns["manager"].count():
+        return True
     waited = turns.sort("start").select(
         blocked=(pl.col("end") - pl.col("start") - pl.col("execution_ns")).median(),
         period=pl.col("start").diff().median(),
@@ -316,6 +349,8 @@ def _turns_of(
 ) -> pl.DataFrame:
     """Select the turns of a loop: all of its threads, unless the node has several loops there."""
     chosen = turns.filter(pl.col("tid").is_in(loop.tids), pid=loop.pid)
+    if loop.is_manager:
+        return chosen.filter(manager=loop.node)
     shared = [
         sibling
         for sibling in loops
@@ -337,7 +372,7 @@ def _callback(callback_id: int, loop: _Loop, turns: pl.DataFrame) -> pl.DataFram
         "valid_from": turns["start"].min(),
         "kind": "loop",
         "node": loop.node,
-        "period_ns": loop_period(turns["start"], turns["due"]),
+        "period_ns": _period(turns),
         "observed": False,
     }
     return pl.DataFrame([row | dict.fromkeys(CALLBACK_SCHEMA.keys() - row)], CALLBACK_SCHEMA)
@@ -396,9 +431,9 @@ def _with_ends(
     published: pl.DataFrame, objects: Objects, loop: _Loop, turns: pl.DataFrame, callback_id: int
 ) -> pl.DataFrame:
     """Add a publication on ``NODE:end`` at the end of each of a named loop's turns."""
-    ends = objects.publishers.filter(
-        pl.col("topic") == loop.node + LOOP_END, pl.col("pid") == loop.pid
-    ).select("publisher", "node", "topic")
+    topic = loop.node + (MANAGER_WRITE if loop.is_manager else LOOP_END)
+    ends = objects.publishers.filter(pl.col("topic") == topic, pl.col("pid") == loop.pid)
+    ends = ends.select("publisher", "node", "topic")
     rows = turns.drop_nulls("end").select(
         *("instance", *_THREAD), time="end", callback_id=pl.lit(callback_id, pl.UInt32)
     )
@@ -406,12 +441,51 @@ def _with_ends(
     return pl.concat([published, rows], how="diagonal")
 
 
+def _overran(turns: pl.DataFrame) -> pl.Expr:
+    """Whether a turn ended when the next one should have begun; null: its device paces the loop.
+
+    A controller manager that was late moves the time to which it sleeps behind its end.
+    """
+    overran = (pl.col("left_ns") <= 0).fill_null(False) | _overlong(turns)
+    if not turns["manager"].count():
+        return overran
+    period = _period(turns)
+    too_late = pl.lit(False) if period is None else pl.col("end") >= pl.col("due") + period
+    return pl.when(pl.col("waits_in").is_null()).then(overran | too_late.fill_null(False))
+
+
+def _period(turns: pl.DataFrame) -> int | None:
+    """Return the period of a loop (ns); None: it has none."""
+    if turns["manager"].count():
+        grid = _grid(turns["due"].drop_nulls().sort().to_numpy())
+        if grid is not None:
+            return grid
+    return loop_period(turns["start"], turns["due"])
+
+
+def _grid(due: npt.NDArray[np.int64]) -> int | None:
+    """Return the period (ns) of which times to sleep are a multiple apart; None: of none.
+
+    A controller manager that is late leaves periods out.
+    """
+    apart = np.diff(due)
+    if len(apart) < 2:
+        return None
+    unit = float(np.percentile(apart, 10))
+    usual = apart[np.abs(apart - unit) <= REGULAR * unit]
+    multiples = apart / max(unit, 1.0)
+    on_grid = (np.abs(multiples - np.round(multiples)) <= REGULAR) & (multiples > 0.5)
+    if not len(usual) or float(np.mean(on_grid)) < MOSTLY:
+        return None
+    return roundest_period(usual, float(np.median(usual)))
+
+
 def _overlong(turns: pl.DataFrame) -> pl.Expr:
     """Whether a turn lasts as long as the loop's usual distance of starts.
 
     A rate loop that is late does not sleep at all: two of its iterations lie in one turn.
     """
-    if loop_period(turns["start"], turns["due"]) is None:
+    if _period(turns) is None:
         return pl.lit(False)
     usual = float(np.median(np.diff(turns["start"].sort().to_numpy())))
     return (pl.col("end") - pl.col("start") >= usual).fill_null(False)
@@ -457,9 +531,15 @@ def seems_regular(times: npt.NDArray[np.int64]) -> bool:
 
 
 def _notes(loop: _Loop, turns: pl.DataFrame) -> Iterator[str]:
-    """Say where a loop has no period."""
+    """Say where a loop has no period, and where its device paces it."""
+    if isinstance(waits_in := turns["waits_in"].first(), str):
+        yield (
+            f"the loop of {loop.node} waits for its device in {waits_in}(), so its period is the"
+            " device's, and no event says when a turn was due: overruns and jitter of start are not"
+            f" known{'; a turn begins when read() returns' if waits_in == 'read' else ''}."
+        )
     starts = turns["start"].sort().to_numpy()
-    if len(starts) < 3 or loop_period(turns["start"], turns["due"]) is not None:
+    if len(starts) < 3 or _period(turns) is not None:
         return
     low, usual, high = (
         duration_text(round(v)) for v in np.percentile(np.diff(starts), (5, 50, 95))

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
+from chainshaper.analysis.manager_loops import manager_ends
 from chainshaper.analysis.matching import first_after, latest_before, nearest
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_SERVICES, LOOP_END, REQUEST, RESPONSE
@@ -184,7 +185,7 @@ def _carrying(tables: events.EventTables, ends: pl.DataFrame, kind: str) -> pl.D
     """Make the frame ``publishers`` or ``subscriptions`` (``kind``) of :class:`Objects`.
 
     Clients and servers whose calls were seen count as both. A loop that the user named publishes
-    the ends of its instances.
+    the ends of its instances, a controller manager those of `write()`.
     """
     parts = [ends.filter(role=kind)]
     internal = pl.col("topic").str.extract("([^/]*)$").is_in(INTERNAL_SERVICES)
@@ -201,7 +202,9 @@ def _carrying(tables: events.EventTables, ends: pl.DataFrame, kind: str) -> pl.D
         loops = named_loops(tables, named_nodes(tables)).select("pid", "node", "valid_from")
         loops = loops.unique(["pid", "node"], keep="first", maintain_order=True)
         loops = loops.with_columns(topic=pl.col("node") + LOOP_END)
-        parts = [pl.concat([*parts, loops], how="diagonal_relaxed")]
+        of_managers = manager_ends(tables, named_nodes(tables))  # each of which has this end only
+        loops = loops.join(of_managers, on=["pid", "node"], how="anti", maintain_order="left")
+        parts = [pl.concat([*parts, loops, of_managers], how="diagonal_relaxed")]
     return pl.concat(parts).drop("role").with_row_index(kind)
 
 

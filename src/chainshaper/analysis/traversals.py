@@ -264,7 +264,7 @@ def _publish_by_sibling(
     of_node = pl.col("node").is_in([callback.node, *(reader.node for reader in reading)])
     of_process = pl.col("pid").is_in(callback.processes)
     candidates = flow.publications.filter((pl.col("topic") == topic) & of_process & of_node)
-    began = pl.coalesce(_looked_up(flow.instances, "start", "instance"), "time")
+    began = pl.coalesce(pl.lit(reading_instants(flow)).gather("instance"), "time")
     candidates = candidates.select(
         *("publisher", "callback_id", "instance", "tid", "time"), later="publication", began=began
     )
@@ -290,7 +290,8 @@ def _publish_by_sibling(
     state = state.with_columns(
         pl.coalesce(publication, later), (pl.col(sibling) | later.is_not_null()).alias(sibling)
     )
-    stores = MESSAGE_FILTER not in (callback.symbol or MESSAGE_FILTER) or loops
+    stores = MESSAGE_FILTER not in (callback.symbol or MESSAGE_FILTER) or bool(loops)
+    stores = stores or (callback.topic, topic) in flow.through
     if callback.kind == "service" or stores:
         return state, []  # a callback that stores its latest message: old values are its purpose
     reached = state[publication].drop_nulls()
@@ -309,6 +310,15 @@ def _publish_by_sibling(
         f"another one: {callback.node} has one of them in it, and no event says which."
     )
     return state, [note] if shared else []
+
+
+def reading_instants(flow: DataFlow) -> pl.Series:
+    """Return from when on each instance no longer sees what is stored (ns): from its start on.
+
+    A controller manager first reads its hardware, and then what was stored.
+    """
+    reads = by_number(flow.turns.drop_nulls("reads"), "instance", "reads", flow.instances.height)
+    return reads.fill_null(flow.instances["start"]) if reads.count() else flow.instances["start"]
 
 
 def _used_in_turn(

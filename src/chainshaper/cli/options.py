@@ -125,6 +125,12 @@ CHAINS: list[str] | None = option(
     "--chain FIRST..LAST",
     "A chain (may be repeated). Default: the one the recording names, or the only one in it.",
 )
+THROUGH: list[str] | None = option(
+    "--through /IN=/OUT",
+    "Messages of topic /IN go into those of /OUT (or NODE:end, NODE:write) in a process, though"
+    " nothing shows it: the newest before each counts (may be repeated).",
+    rich_help_panel="What no event shows",
+)
 STRICT: bool = option("--strict", "Exit code 1 unless the plan's promise is met.", False)
 PLAN_IN_FORCE: Path | None = option(
     "--plan plan.yaml", "The plan that the last recording was made with, where it does not say so."

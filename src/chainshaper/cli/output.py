@@ -187,10 +187,15 @@ def lasting(report: Progress, seconds: float, stage: str) -> Iterator[None]:
 
 
 @contextmanager
-def opened(verb: str, trace: Sequence[Path]) -> "Iterator[tuple[cs.Recording, Progress]]":
-    """Open a trace or recording for a verb; yield it with what reports the verb's progress."""
+def opened(
+    verb: str, trace: Sequence[Path], through: Sequence[str] | None = None
+) -> "Iterator[tuple[cs.Recording, Progress]]":
+    """Open a trace or recording for a verb; yield it with what reports the verb's progress.
+
+    ``through`` is what the user declares that no event shows.
+    """
     with late_progress(verb) as report:
-        yield cs.open_source(*trace, progress=report), report
+        yield cs.open_source(*trace, progress=report, through=through or ()), report
 
 
 def lost_events(recording: "cs.Recording") -> str:

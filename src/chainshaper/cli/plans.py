@@ -24,6 +24,7 @@ def plan(
         " only one in it. Give several to plan them together: what they share, and when each one's"
         " cycles start.",
     ),
+    through: list[str] | None = opt.THROUGH,
     output: Path | None = opt.option(
         "--output -o plan.yaml",
         "File to write; of several chains also a folder, for a plan each. Must not exist.",
@@ -78,7 +79,7 @@ def plan(
     if recording is None:
         profiles = _profile_of_latencies(latencies, period, [*wanted, *(sink or [])], since, until)
     else:
-        with out.opened("plan", [recording]) as (source, report):
+        with out.opened("plan", [recording], through) as (source, report):
             report(0.5, "measuring the chains")
             profiles = cs.profile_chains(
                 source,

@@ -40,6 +40,7 @@ def describe(
     trace: list[Path] = opt.TRACE,
     output: Path = opt.option("--output -o app.yaml", "File to write; must not exist.", ...),
     chain: str | None = opt.CHAIN,
+    through: list[str] | None = opt.THROUGH,
 ) -> None:
     """Write the description of an application from a recording, with its execution times.
 
@@ -49,7 +50,7 @@ def describe(
     from chainshaper.values.files import new_file, write_whole
 
     new_file(output, opt.DESCRIPTIONS)
-    with out.opened("describe", trace) as (recording, _):
+    with out.opened("describe", trace, through) as (recording, _):
         text, notes = application_file(recording, chain)
         out.notes(notes)
     out.show_line(write_whole(output, [text.encode()]))
@@ -67,6 +68,7 @@ def graph(
         "/parameter_events. In JSON they are always there, marked as internal.",
         False,
     ),
+    through: list[str] | None = opt.THROUGH,
     json: bool = opt.JSON,
 ) -> None:
     """Show the application: nodes, callbacks with kind, period and function, topics, services."""
@@ -75,7 +77,7 @@ def graph(
 
     if output is not None:
         new_file(output, graph_drawing.ENDINGS)
-    with out.opened("graph", trace) as (recording, report):
+    with out.opened("graph", trace, through) as (recording, report):
         application = cs.describe_application(recording)
         if output is not None:
             report(0.9, "drawing")
@@ -121,6 +123,7 @@ def chains(
         "--to Y", "Topic or node where they end. Default: topics from which nothing goes on."
     ),
     limit: int = opt.option("--limit", "How many to list.", 100, min=1),
+    through: list[str] | None = opt.THROUGH,
     json: bool = opt.JSON,
 ) -> None:
     """List the computation chains, count them, and show the heaviest.
@@ -130,7 +133,7 @@ def chains(
     from chainshaper.analysis import graph_of, recorded_flow
     from chainshaper.reporting import overviews
 
-    with out.opened("chains", trace) as (recording, report):
+    with out.opened("chains", trace, through) as (recording, report):
         flow = recorded_flow(recording)
         report(0.9, "searching chains")
         application, listed = graph_of(flow), cs.list_chains(flow, start, end, limit)
@@ -147,6 +150,7 @@ def chains(
 def latency(
     trace: list[Path] = opt.TRACE,
     chain: str | None = opt.CHAIN,
+    through: list[str] | None = opt.THROUGH,
     chains: Path | None = opt.option(
         "--chains FILE", "A CARET architecture file: --chain then names one of its named_paths."
     ),
@@ -170,7 +174,7 @@ def latency(
         raise InputError("--instances goes with --json: add it")
     chain = chain if chains is None else named_chain(chains, chain)
     named = () if chain is None else ("--chain", chain)
-    with out.opened("latency", trace) as (recording, report):
+    with out.opened("latency", trace, through) as (recording, report):
         measurement = cs.measure_latency(recording, chain)
         drawn: tuple[Path, ...] = ()
         if figures is not None:
@@ -410,6 +414,7 @@ def judge(comparisons: "Sequence[cs.Comparison]", *, strict: bool, json: bool) -
 def compare(
     recordings: list[Path] = opt.argument("REC REC...", "Recordings' folders.", ...),
     chain: str | None = opt.CHAIN,
+    through: list[str] | None = opt.THROUGH,
     figures: Path | None = opt.option(
         "--figures DIR", "Draw latency.png, hops.png and distribution.png into this folder."
     ),
@@ -427,7 +432,8 @@ def compare(
 
     in_force = opt.plan_in_force(plan)
     with out.late_progress("compare") as progress:
-        comparisons = cs.compare_chains(recordings, chain, in_force, progress=progress)
+        opened = [cs.open_source(path, through=through or ()) for path in recordings]
+        comparisons = cs.compare_chains(opened, chain, in_force, progress=progress)
         if figures is not None:
             from chainshaper.reporting.figures import draw_comparison
 
@@ -446,6 +452,7 @@ def report(
     recordings: list[Path] = opt.argument("REC...", "Recordings' or LTTng traces' folders.", ...),
     output: Path = opt.option("--output -o FILE.html", "File to write; must not exist.", ...),
     chain: str | None = opt.CHAIN,
+    through: list[str] | None = opt.THROUGH,
     plan: Path | None = opt.PLAN_IN_FORCE,
     cycles: list[int] | None = opt.option(
         "--cycle N",
@@ -468,7 +475,8 @@ def report(
     new_file(output, ENDINGS)
     in_force = opt.plan_in_force(plan)
     with out.late_progress("report") as progress:
-        comparisons = cs.compare_chains(recordings, chain, in_force, least=1, progress=progress)
+        opened = [cs.open_source(path, through=through or ()) for path in recordings]
+        comparisons = cs.compare_chains(opened, chain, in_force, least=1, progress=progress)
         progress(0.9, "drawing")
         written = cs.write_report(comparisons, output, cycles or ()).absolute()
     if out.present(json, {"report": str(written), **comparisons_json(comparisons)}):
@@ -487,6 +495,7 @@ def export(
         "--layout FILE", "With --mcap: also write the layout of Foxglove's panels (.json)."
     ),
     chain: str | None = opt.CHAIN,
+    through: list[str] | None = opt.THROUGH,
     plan: Path | None = opt.PLAN_IN_FORCE,
 ) -> None:
     """Write a recording for another tool: threads, callbacks, messages, slots, stalls.
@@ -504,7 +513,7 @@ def export(
     if layout is not None and not mcap:
         raise InputError("--layout is for Foxglove: add --mcap")
     in_force = opt.plan_in_force(plan)
-    with out.opened("export", trace) as (recording, report):
+    with out.opened("export", trace, through) as (recording, report):
         report(0.5, "analysing")
         measured = None
         with suppress(SeveralChainsError):

@@ -5,23 +5,40 @@ verb and no analysis needs to know the difference. A :class:`Tracer` is the part
 LTTng, eBPF and the library in front do differently.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
 from chainshaper.values.errors import InputError
 from chainshaper.values.events import EventTables
+from chainshaper.values.handed_over import parse_through
 from chainshaper.values.recording import INFO_FILE, Recording, RecordingInfo, open_recording
 
 
 def open_source(
-    *paths: str | Path, progress: Callable[[float, str], None] | None = None
+    *paths: str | Path,
+    progress: Callable[[float, str], None] | None = None,
+    through: Sequence[str] = (),
 ) -> Recording:
     """Open a recording's folder; or an LTTng trace (CTF 1.8), which may have several folders.
 
-    ``progress`` gets the share that is done, from 0 to 1, and what is being done.
-    Raises InputError: there is nothing that can be read.
+    ``progress`` gets the share that is done, from 0 to 1, and what is being done. ``through``
+    declares what no event shows (:func:`~chainshaper.values.handed_over.parse_through`).
+    Raises InputError: there is nothing that can be read, or ``through`` declares nothing.
     """
+    declared = parse_through(through)
+    recording = _opened(paths, progress)
+    if not declared:
+        return recording
+    known = dict.fromkeys((*recording.info.through, *declared))
+    return replace(recording, info=recording.info.model_copy(update={"through": tuple(known)}))
+
+
+def _opened(
+    paths: Sequence[str | Path], progress: Callable[[float, str], None] | None
+) -> Recording:
+    """Open a recording or a trace."""
     if not paths:
         raise InputError("no recording given: name a recording's or a trace's folder")
     folders = [Path(path) for path in paths]

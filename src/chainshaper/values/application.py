@@ -22,6 +22,9 @@ REQUEST, RESPONSE = ":request", ":response"
 """Endings of a service's name: requests and responses are treated as messages on such topics."""
 LOOP_END = ":end"
 """Ending of a node's name: the end of each instance of its named loop counts as a message there."""
+MANAGER_WRITE = ":write"
+"""Ending of a controller manager's name (ros2_control): that `write()` returned counts so, too."""
+LOOP_ENDS = (LOOP_END, MANAGER_WRITE)
 CallbackKind: TypeAlias = Literal["timer", "subscription", "service", "client", "loop", "unknown"]
 """What starts a callback.
 
@@ -124,6 +127,7 @@ class ApplicationGraph:
     callbacks: tuple[Callback, ...]
     publishers: dict[str, tuple[str, ...]] = field(default_factory=dict)
     subscribers: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    through: tuple[tuple[str, str], ...] = ()  # declared: messages of the first go into the second
 
     @property
     def topics(self) -> tuple[str, ...]:

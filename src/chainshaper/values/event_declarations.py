@@ -578,6 +578,10 @@ LOOP_MOVES = (
     "over",  # the process that had it moved does not ask any more
 )
 
+# The functions of `controller_manager::ControllerManager` that ros2_control's loop calls in each of
+# its turns, by the numbers in `controller_manager_call`.
+MANAGER_FUNCTIONS = ("read", "update", "write")
+
 _OURS = (
     # The user named a loop by its node, which was created in this process (`is_thread` 0), or by
     # the name of its thread, which is the event's `tid`.
@@ -585,6 +589,26 @@ _OURS = (
         "loop_named",
         "creation",
         (EventField("name", "text", 0), EventField("is_thread", "count", 1)),
+        recorded_by_library="arguments",
+    ),
+    # A controller manager of ros2_control was called for the first time. It is a node.
+    Event(
+        "controller_manager_found",
+        "creation",
+        (EventField("manager", "address", 0), EventField("name", "text", 1)),  # empty: not known
+        recorded_by_library="arguments",
+    ),
+    # A function of it returned. The tracing library emits it, which stands in front of the three.
+    Event(
+        "controller_manager_call",
+        "messages",
+        (
+            EventField("manager", "address", 0),
+            EventField("function", "count", 1),  # place in MANAGER_FUNCTIONS
+            EventField("thread_time", "nanoseconds", 2),  # when it returned
+            EventField("began", "nanoseconds", 3),
+            EventField("thread_time_began", "nanoseconds", 4),
+        ),
         recorded_by_library="arguments",
     ),
     # A thread goes to sleep for a time, outside callbacks, or wakes up from it: what lies between a

@@ -127,6 +127,8 @@ class RecordingInfo(BaseModel, frozen=True):
     trace_events: dict[str, Integer] = {}  # how many the converted trace had, by event
     stall_meter: StallMeterInfo | None = None
     chain: str | None = None  # the chain the application's description names first
+    # What the user declared of topics (values/handed_over.py): input and output.
+    through: tuple[tuple[str, str], ...] = ()
     application: dict[str, Any] | None = None  # the description that ran, when we ran it
     plan: dict[str, Any] | None = None  # the plan in force, when one was
     in_force: InForceInfo | None = None  # None: no plan was in force, or an old version recorded

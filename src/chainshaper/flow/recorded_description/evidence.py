@@ -19,7 +19,7 @@ from chainshaper.flow.recorded_description.timers import blocker_of
 from chainshaper.values import events
 from chainshaper.values.application import (
     INTERNAL_TOPICS,
-    LOOP_END,
+    LOOP_ENDS,
     ApplicationGraph,
     Callback,
     Chain,
@@ -52,7 +52,8 @@ class Evidence:
 
 def own_topics(callback: Callback) -> list[str]:
     """Return the topics that a callback publishes itself; the end of a loop's instance is none."""
-    left_out = INTERNAL_TOPICS | {*callback.passes_on, callback.node + LOOP_END}
+    ends = {callback.node + ending for ending in LOOP_ENDS}
+    left_out = INTERNAL_TOPICS | {*callback.passes_on, *ends}
     return [topic for topic in callback.publishes if topic not in left_out]
 
 

@@ -64,7 +64,8 @@ STARTED_SO = 'eval "$(chainshaper watch --environment --loop NAME)"'
 def notes(names: Sequence[str], tables: events.EventTables) -> Iterator[str]:
     """Say which of the named loops were not seen, and why."""
     seen = events.table(tables, "loop_named")
-    slept = events.table(tables, "thread_sleep")["pid"].unique()
+    by_name = events.table(tables, "controller_manager_call")["pid"].unique()
+    slept = events.table(tables, "thread_sleep")["pid"].append(by_name).unique()
     for name in dict.fromkeys(names):
         met = seen.filter(name=name)
         if met.is_empty():

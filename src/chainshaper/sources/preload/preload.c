@@ -34,6 +34,9 @@
 // All others pass by two comparisons. The sleeps of such a loop can be moved: another process asks for
 // it in the ring of the thread (`struct request`).
 //
+// The loop of ros2_control is known by name: we stand in front of the three functions of its controller
+// manager that the loop calls in each turn.
+//
 // Times are ns of CLOCK_MONOTONIC. Values are a function's arguments as they are in registers (of a
 // bool only the lowest byte counts). Calls of services have trace points from Kilted on only; so we
 // record them where librcl calls rmw.
@@ -41,6 +44,7 @@
 // Upstream: `tracetools/tracetools.h` of ros2_tracing, tags 4.1.1 to 8.10.1: all arguments are
 // integers or pointers, at most five, so functions of all versions can be called in the same way.
 // rmw, `rmw/types.h` and `rmw/rmw.h`, Humble to Rolling: `rmw_service_info_t`, `rmw_request_id_t`.
+// ros2_control, `controller_manager/controller_manager.hpp`, 2.8.0 (Humble) to 6.8.0.
 #define _GNU_SOURCE
 #undef _FORTIFY_SOURCE  // with it headers define some of the functions that we stand in front of
 #include <dlfcn.h>
@@ -128,6 +132,8 @@ static struct stat identity;  // of the file behind it
 static pthread_key_t at_end;
 static bool has_key;
 static _Atomic bool has_named_node;  // a node whose loop is named was created in this process
+#define MANAGERS 16u
+static _Atomic uintptr_t managers[MANAGERS];  // controller managers that were called; 0: none yet
 // In a page that the kernel fills with zeros in a child process: 1 while `memory` is this process's.
 static volatile uint32_t *memory_is_ours = &(volatile uint32_t){1};
 struct rseq_area {  // struct rseq of <linux/rseq.h>, which older systems do not have
@@ -362,6 +368,7 @@ static void in_child(void) {
   if (memory) munmap(memory, sizeof(struct memory));
   memory = NULL;
   refused = has_named_node = false;
+  for (unsigned place = 0; place < MANAGERS; place++) managers[place] = 0;
   if (has_key) pthread_setspecific(at_end, NULL);
   memset(&thread, 0, sizeof thread);
 }
@@ -1219,3 +1226,75 @@ int rmw_wait(void *subscriptions, void *conditions, void *services, void *client
   if (recorded) end_sleep(sleeps_by_rmw_wait);
   return result;
 }
+
+// The functions of ros2_control's controller manager, by their names as the compiler has them:
+// `read`, `update` and `write` of `controller_manager::ControllerManager`, with a `const rclcpp::Time &`
+// and a `const rclcpp::Duration &`. `update` returns an enumeration of a byte, the others nothing:
+// the register goes through as it is. They may throw: this file is compiled so that exceptions pass.
+#define OF_MANAGER(name) _ZN18controller_manager17ControllerManager##name##ERKN6rclcpp4TimeERKNS1_8DurationE
+#define NAME_OF_NODE "_ZNK6rclcpp4Node24get_fully_qualified_nameEv"
+#define TEXT_OF(name) #name
+#define AS_TEXT(name) TEXT_OF(name)
+
+// The function of this name behind ours, for a caller that linked it. A plugin's libraries (Gazebo's)
+// are not in the scope that RTLD_NEXT searches, but in that of the plugin, which calls.
+static void *function_of_caller(const char *name, const void *caller) {
+  void *address = dlsym(RTLD_NEXT, name);
+  Dl_info plugin;
+  if (address || !dladdr(caller, &plugin) || !plugin.dli_fname) return address;
+  void *library = dlopen(plugin.dli_fname, RTLD_LAZY | RTLD_NOLOAD);
+  return library ? dlsym(library, name) : NULL;
+}
+
+// At the first call of a manager: say which node it is. A controller manager is a `rclcpp::Node`.
+// From here on the sleeps of its thread are recorded, too: until when it wanted to sleep.
+static void meet_manager(uintptr_t manager, const void *caller) {
+  thread.is_named = true;
+  for (unsigned place = 0; place < MANAGERS; place++) {
+    uintptr_t known = 0;
+    if (managers[place] == manager) return;
+    if (!atomic_compare_exchange_strong(&managers[place], &known, manager)) {
+      if (known == manager) return;
+      continue;
+    }
+    const char *(*name_of)(uintptr_t) =
+      (const char *(*)(uintptr_t))function_of_caller(NAME_OF_NODE, caller);
+    const char *name = name_of ? name_of(manager) : NULL;
+    create(number_controller_manager_found, 2, 0, (uint64_t[6]){manager, (uintptr_t)name});
+    return;
+  }
+}
+
+// Without us a program that lacks the function would not have started.
+static void *behind_manager(const char *name, const void *caller) {
+  void *function = function_of_caller(name, caller);
+  if (function) return function;
+  static const char reason[] = "chainshaper: libcontroller_manager.so is loaded in a way that hides "
+                               "it; run the node without LD_PRELOAD\n";
+  if (syscall(SYS_write, 2, reason, sizeof reason - 1) < 0) abort();
+  abort();
+}
+
+#define MANAGER_CALL(name, place) \
+  uint64_t OF_MANAGER(name)(uintptr_t manager, const void *time, const void *period) { \
+    static uint64_t (*_Atomic behind)(uintptr_t, const void *, const void *); \
+    const void *caller = __builtin_return_address(0); \
+    if (!behind) \
+      behind = (uint64_t(*)(uintptr_t, const void *, const void *))behind_manager( \
+        AS_TEXT(OF_MANAGER(name)), caller); \
+    int before = errno; \
+    meet_manager(manager, caller); \
+    bool recorded = (thread.ring && *memory_is_ours) || has_ring(); \
+    uint64_t began = now(CLOCK_MONOTONIC), used = thread_time(began); \
+    errno = before; \
+    uint64_t result = behind(manager, time, period); \
+    before = errno; \
+    if (recorded) \
+      write_record(number_controller_manager_call, 0, 5, \
+                   (uint64_t[6]){manager, place, 0, began, used}, true); \
+    errno = before; \
+    return result; \
+  }
+MANAGER_CALL(4read, 0)
+MANAGER_CALL(6update, 1)
+MANAGER_CALL(5write, 2)
