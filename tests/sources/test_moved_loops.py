@@ -16,7 +16,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from chainshaper.analysis.loop_phase import phase_of
+from chainshaper.flow.loop_phase import phase_of
 from chainshaper.linux.threads import list_threads
 from chainshaper.sources.preload import LoopMover, PreloadTracer, move_loop
 from chainshaper.values.errors import InputError, OperationError

@@ -20,10 +20,10 @@ import threading
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from chainshaper.analysis.loop_phase import LoopPhase, PhaseTrack, phase_of
 from chainshaper.enforcement.undoing import LoopStep
+from chainshaper.flow.loop_phase import LoopPhase, PhaseTrack, phase_of
 from chainshaper.linux.threads import list_threads
 from chainshaper.planning.chain_plan import (
     ChainPlan,
@@ -34,10 +34,12 @@ from chainshaper.planning.chain_plan import (
 )
 from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.plan import Plan
-from chainshaper.sources.preload.moving import LoopMoved, LoopMover
 from chainshaper.splicing.shaped_outputs import FollowedOutput
 from chainshaper.values.durations import duration_text
-from chainshaper.values.errors import ChainshaperError, InputError, OperationError
+from chainshaper.values.errors import ChainshaperError, InputError, OperationError, PlatformError
+
+if TYPE_CHECKING:  # it loads tables, which robots without loops in step need not have
+    from chainshaper.sources.preload.moving import LoopMoved, LoopMover
 
 TOLERANCE_NS = 30_000  # nothing is moved for less
 LOOK_S = 0.1
@@ -56,7 +58,7 @@ class LoopStarts(Protocol):
     def turn_ns(self) -> int: ...
     @property
     def is_there(self) -> bool: ...
-    def seen(self) -> tuple[list[int], list[LoopMoved]]: ...
+    def seen(self) -> "tuple[list[int], list[LoopMoved]]": ...
     def move(self, move_ns: int, period_ns: int) -> int: ...
     def renew(self) -> None: ...
     def close(self) -> None: ...
@@ -102,10 +104,10 @@ def next_move(
 class OwnStarts:
     """When a loop would have started by itself: its starts without what it was moved by."""
 
-    moves: list[LoopMoved] = field(default_factory=list)  # the latest ones
+    moves: "list[LoopMoved]" = field(default_factory=list)  # the latest ones
     moved_ns: int = 0  # by now
 
-    def of(self, starts_ns: Sequence[int], moves: Sequence[LoopMoved]) -> list[int]:
+    def of(self, starts_ns: Sequence[int], moves: "Sequence[LoopMoved]") -> list[int]:
         """Return starts (ns, in order) without the moves before each of them."""
         left, own = [*moves], list[int]()
         for start in starts_ns:
@@ -352,12 +354,14 @@ class InStep:
         self.steps = (*self.steps, step)[-STEPS:]
 
 
-def find_loop(pid: int, loop: PlannedLoop, lease_ns: int = 5_000_000_000) -> LoopMover | None:
+def find_loop(pid: int, loop: PlannedLoop, lease_ns: int = 5_000_000_000) -> "LoopMover | None":
     """Return a planned loop of a process, as the library in front sees it; None: it has none.
 
     It is the thread of the planned name or, where none is planned, that starts at the period. What
     was seen of the loop before is still to be taken with ``seen``.
     """
+    from chainshaper.sources.preload.moving import LoopMover
+
     for thread in list_threads(pid):
         if loop.thread not in (None, thread.comm):
             continue
@@ -388,7 +392,8 @@ def with_loops_as_they_are(plan: Plan) -> Plan:
 def loops_in_step(plan: Plan, adapt: bool = False) -> list[tuple[int, ChainPlan, PlannedLoop]]:
     """Return the chains of a plan that are in step with a loop: place, chain and loop.
 
-    Raises InputError: their slots are to follow latencies as well (``adapt``).
+    Raises InputError: their slots are to follow latencies as well (``adapt``). PlatformError: what
+    the library in front sees cannot be read here.
     """
     chains = [
         (place, chain, chain.loop)
@@ -400,4 +405,12 @@ def loops_in_step(plan: Plan, adapt: bool = False) -> list[tuple[int, ChainPlan,
             f"slots of {chain_name(chains[0][1])} are in step with a loop, so they cannot follow"
             " latencies: leave out --adapt, or plan without --in-step"
         )
+    if chains:
+        try:
+            import chainshaper.sources.preload.moving  # noqa: F401 - whether it is there
+        except ModuleNotFoundError as error:
+            raise PlatformError(
+                f"a chain in step with a loop needs {error.name}, which is not installed here:"
+                " install it, or plan without --in-step and --move-loop"
+            ) from error
     return chains

@@ -2,13 +2,16 @@
 
 import time
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from chainshaper.flow.phase import watch_wake_ups
 from chainshaper.linux.threads import find_thread
-from chainshaper.sources.preload.moving import LoopMoved
 from chainshaper.values.errors import OperationError
+
+if TYPE_CHECKING:
+    from chainshaper.sources.preload.moving import LoopMoved
 
 _TURNS = 24  # of the loop, in one look
 _REST_NS = 2_000_000_000  # from one look to the next
@@ -29,7 +32,7 @@ class PolledLoop:
         thread = find_thread(self.tid)
         return thread is not None and thread.pid == self.pid
 
-    def seen(self) -> tuple[list[int], list[LoopMoved]]:
+    def seen(self) -> "tuple[list[int], list[LoopMoved]]":
         """Watch for some of its turns, and return when it woke up behind a rest (ns).
 
         Where it waits for a lock within a turn, it wakes up several times. Between two looks it is

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from chainshaper.analysis.loop_phase import FEWEST, RESTARTED, PhaseTrack, phase_of
+from chainshaper.flow.loop_phase import FEWEST, RESTARTED, PhaseTrack, phase_of
 
 MS = 1_000_000
 PERIOD = 10 * MS
