@@ -305,6 +305,12 @@ class _Search:
             raise self.wrong(f"{problem} application does")
         if name.endswith(LOOP_END):
             raise self._without_end(name.removesuffix(LOOP_END), nodes.keys())
+        if name.endswith(MANAGER_WRITE) and {name.removesuffix(MANAGER_WRITE)} & nodes.keys():
+            raise self.wrong(
+                f"{name.removesuffix(MANAGER_WRITE)} is no controller manager (ros2_control) whose"
+                " write() the library in front saw: record it with `chainshaper record --source"
+                " preload`, or end the chain with the topic that its loop publishes"
+            )
         hint = f"the names there are: {_some(topics - INTERNAL_TOPICS or topics)};"
         hint += " `chainshaper graph` shows all of them"
         if close := close_names(name, topics | nodes.keys()):

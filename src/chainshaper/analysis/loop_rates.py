@@ -8,7 +8,7 @@ import polars as pl
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.loops import loop_period
 from chainshaper.values import events
-from chainshaper.values.application import LOOP_END
+from chainshaper.values.application import LOOP_ENDS
 from chainshaper.values.durations import duration_text
 
 
@@ -71,7 +71,8 @@ def loop_instances(flow: DataFlow) -> pl.DataFrame:
     names = names.unique("callback_id", keep="first", maintain_order=True)
     topic = pl.col("topic").cast(pl.String)
     topics = flow.publications.select("callback_id", topic).drop_nulls()
-    topics = topics.filter(~topic.str.ends_with(LOOP_END))
+    for ending in LOOP_ENDS:
+        topics = topics.filter(~topic.str.ends_with(ending))
     published = topics.group_by("callback_id").agg(publishes=topic.unique().sort())
     names = names.join(published, on="callback_id", how="left")
     rows = flow.instances.join(names, on="callback_id").join(flow.turns, on="instance", how="left")

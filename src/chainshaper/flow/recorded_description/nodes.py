@@ -17,7 +17,7 @@ from chainshaper.analysis.graph import MESSAGE_FILTER
 from chainshaper.flow.recorded_description.costs import delivery_times
 from chainshaper.flow.recorded_description.evidence import Evidence, own_topics
 from chainshaper.flow.recorded_description.timers import Expiry, blocker_of, expiry_of
-from chainshaper.values.application import INTERNAL_TOPICS, LOOP_END, Callback
+from chainshaper.values.application import INTERNAL_TOPICS, LOOP_END, LOOP_ENDS, Callback
 from chainshaper.values.durations import duration_text, format_duration
 
 Numbers = npt.NDArray[np.int64]
@@ -150,9 +150,10 @@ def described_chain(evidence: Evidence, nodes: Mapping[str, DescribedNode]) -> s
 
 def _point(point: str, topics: Collection[str], named: Mapping[str, str]) -> str:
     """Return a chain's way point by the name that it has in the description."""
-    if point.endswith(LOOP_END):
-        node = point.removesuffix(LOOP_END)
-        return named.get(node, node) + LOOP_END
+    for ending in LOOP_ENDS:  # in a description, that of a controller manager is a loop's as well
+        if point.endswith(ending):
+            node = point.removesuffix(ending)
+            return named.get(node, node) + LOOP_END
     return point if {point, f"/{point}"} & {*topics} else named.get(point, point)
 
 
