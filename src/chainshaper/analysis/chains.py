@@ -25,6 +25,7 @@ from typing import TypeAlias, TypeVar
 from chainshaper.values.application import (
     INTERNAL_TOPICS,
     LOOP_END,
+    LOOP_ENDS,
     MANAGER_WRITE,
     REQUEST,
     RESPONSE,
@@ -303,22 +304,17 @@ class _Search:
         if not topics:
             problem = "the recording shows no topics at all; tracing has to start before the"
             raise self.wrong(f"{problem} application does")
-        if name.endswith(LOOP_END):
-            raise self._without_end(name.removesuffix(LOOP_END), nodes.keys())
-        if name.endswith(MANAGER_WRITE) and {name.removesuffix(MANAGER_WRITE)} & nodes.keys():
-            raise self.wrong(
-                f"{name.removesuffix(MANAGER_WRITE)} is no controller manager (ros2_control) whose"
-                " write() the library in front saw: record it with `chainshaper record --source"
-                " preload`, or end the chain with the topic that its loop publishes"
-            )
+        if name.endswith(LOOP_ENDS):
+            raise self._without_end(name, nodes.keys())
         hint = f"the names there are: {_some(topics - INTERNAL_TOPICS or topics)};"
         hint += " `chainshaper graph` shows all of them"
         if close := close_names(name, topics | nodes.keys()):
             hint = f"did you mean {' or '.join(close)}?"
         raise self.wrong(f"no topic or node is called {name}; {hint}")
 
-    def _without_end(self, name: str, nodes: Collection[str]) -> InputError:
-        """Make an error that says why there is no end of a loop, NODE:end."""
+    def _without_end(self, end: str, nodes: Collection[str]) -> InputError:
+        """Make an error that says why there is no end of a loop, NODE:end or NODE:write."""
+        name, _, ending = end.rpartition(":")
         node = name if name in nodes else f"/{name}"
         if node not in nodes:
             close = close_names(name, nodes)
@@ -326,6 +322,12 @@ class _Search:
                 f"did you mean {' or '.join(close)}?" if close else "`chainshaper graph` shows all"
             )
             return self.wrong(f"no node is called {name}, whose loop has an end; {hint}")
+        if ending == MANAGER_WRITE.removeprefix(":"):
+            return self.wrong(
+                f"{node} is no controller manager (ros2_control) whose write() the library in front"
+                " saw: record it with `chainshaper record --source preload`, or end the chain with"
+                " the topic that its loop publishes"
+            )
         loops = [c for c in self.graph.callbacks if c.kind == "loop" and c.node == node]
         wrote = sorted({topic for loop in loops for topic in loop.publishes})
         of_node = f"{node} has no loop that was named, or that was seen to sleep"
