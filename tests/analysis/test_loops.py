@@ -48,6 +48,20 @@ def test_what_is_published_before_the_first_sleep_is_followed_from_its_publicati
     assert latencies(story, "/cmd../out") == [(21, 29), (100, 138)]
 
 
+def test_a_thread_that_waits_until_now_looks_and_does_not_sleep() -> None:
+    """Fast DDS does so in `spin_some`: on real ROS 2 every second message cut a turn in two."""
+    story = Story()
+    first_sleep(story, 40, 99)
+    about = {"call": SLEEPING_CALLS.index("pthread_cond_timedwait"), "thread_time": 0}
+    for woke in (100, 200, 300):
+        story.event("thread_wake", woke, PID, LOOP, call=NANOSLEEP, thread_time=0)
+        story.event("thread_sleep", woke + 10, PID, LOOP, until=woke + 8, **about)
+        story.event("thread_wake", woke + 12, PID, LOOP, **about)
+        first_sleep(story, woke + 50, woke + 99)
+    turns = thread_turns(story.tables()).select("start", "end", "due")
+    assert turns.rows() == [(woke, woke + 50, woke - 1) for woke in (100, 200, 300)]
+
+
 def test_a_turn_whose_sleep_was_lost_has_no_end() -> None:
     story = Story()
     first_sleep(story, 40, 99)

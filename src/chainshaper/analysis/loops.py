@@ -49,6 +49,7 @@ _CHOSEN = 0.5  # of these instants, more must be so exactly a period apart
 _FOR_A_TIME = [SLEEPING_CALLS.index(name) for name in ("clock_nanosleep", "nanosleep", "timerfd")]
 """Calls by which a thread can only sleep, not wait for something."""
 _UNTIMED = SLEEPING_CALLS.index("pthread_cond_wait")
+_LOOK_NS = 100_000  # a wait until an instant that is over, by no more than this, is a look
 _ALONE = 0.1  # other sleeps of a thread, for each of its waits without a time
 
 
@@ -110,6 +111,11 @@ def thread_turns(tables: events.EventTables) -> pl.DataFrame:
     untimed = (pl.col("call") == _UNTIMED).fill_null(False)
     others = (~untimed & ~pl.col("wakes")).sum().over(_THREAD)
     rows = rows.filter(~untimed | (others <= _ALONE * untimed.sum().over(_THREAD)))
+    # A thread that looks whether there is work (`spin_some`) waits until now: it does not sleep.
+    over_by = pl.col("time") - pl.col("until")
+    looks = over_by.is_between(0, _LOOK_NS) & ~pl.col("call").is_in(_FOR_A_TIME)
+    rows = rows.with_columns(looks=looks.fill_null(False))
+    rows = rows.filter(~pl.col("looks") & ~pl.col("looks").shift(1, fill_value=False).over(_THREAD))
 
     def beside(column: str, places: int) -> pl.Expr:
         """Return the column of the thread's sleep before (1) or after (-1) a row."""
