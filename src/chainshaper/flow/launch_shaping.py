@@ -351,7 +351,9 @@ def _measured_before(
     measured: dict[int, tuple[Recording, Profile]] = {}  # by place in `wanted`
     for number, places in enumerate(undelayed(look.profiles, look.core_of), start=1):
         chains = [look.wanted[place] for place in places]
-        cores = {node: look.core_of[node] for node in chain_nodes(look.recording, *chains)}
+        # Nodes behind the shaped output, as those of a loop that reads it, have no core here.
+        nodes = [*chain_nodes(look.recording, *chains)]
+        cores = {node: look.core_of[node] for node in nodes if node in look.core_of}
         condition = profiling_condition(
             cores,
             cores,
