@@ -145,6 +145,16 @@ def threads_gated(plan: Plan, nodes: StartedNodes) -> Iterator[None]:
         raise OperationError(f"the servers failed while the application ran: {failure}")
 
 
+def _in_force_from(plan: Plan, chain: ChainPlan, nodes: StartedNodes, _: int) -> int:
+    """Return from when on slots may move: the middle of the second cycle from now on (ns).
+
+    No slot is there.
+    """
+    anchor_ns = nodes.start_ns if plan.moves_timers else nodes.anchor_ns
+    since = time.monotonic_ns() + 2 * chain.cycle_ns
+    return since + (anchor_ns + chain.offset_ns + chain.cycle_ns // 2 - since) % chain.cycle_ns
+
+
 @contextmanager
 def slots_followed(
     plan: Plan,
@@ -156,20 +166,13 @@ def slots_followed(
 
     ``enforcement`` is entered as well, if there is one; raises as that does.
     """
-    anchor_ns = nodes.start_ns if plan.moves_timers else nodes.anchor_ns
-
-    def in_force_from(chain: ChainPlan, _: int) -> int:
-        """From the middle of the second cycle from now on, where no slot is (ns)."""
-        since = time.monotonic_ns() + 2 * chain.cycle_ns
-        return since + (anchor_ns + chain.offset_ns + chain.cycle_ns // 2 - since) % chain.cycle_ns
-
     with ExitStack() as until:
         if enforcement is not None:
             until.enter_context(enforcement(nodes))
         followers = []
         for place, reach_ns in reaches_ns.items():
             chain = plan.chains[place]
-            in_force = partial(in_force_from, chain)
+            in_force = partial(_in_force_from, plan, chain, nodes)
             follower = SlotFollower(chain, nodes.pids.values(), reach_ns, in_force)
             followers.append(follower)
             until.callback(follower.end)
@@ -188,13 +191,6 @@ def loops_kept_in_step(
     Gives the events of how loops were moved. ``enforcement`` is entered as well, if there is one;
     raises as that does.
     """
-    anchor_ns = nodes.start_ns if plan.moves_timers else nodes.anchor_ns
-
-    def in_force_from(chain: ChainPlan, _: int) -> int:
-        """From the middle of the second cycle from now on, where no slot is (ns)."""
-        since = time.monotonic_ns() + 2 * chain.cycle_ns
-        return since + (anchor_ns + chain.offset_ns + chain.cycle_ns // 2 - since) % chain.cycle_ns
-
     with ExitStack() as until:
         if enforcement is not None:
             until.enter_context(enforcement(nodes))
@@ -203,7 +199,9 @@ def loops_kept_in_step(
             if loop.node not in nodes.pids:
                 raise InputError(f"{loop.node}, the plan's loop, is no node of the application")
             find = partial(find_loop, nodes.pids[loop.node], loop)
-            step = InStep(chain, nodes.pids.values(), find, partial(in_force_from, chain))
+            step = InStep(
+                chain, nodes.pids.values(), find, partial(_in_force_from, plan, chain, nodes)
+            )
             kept.append(step)
             until.callback(step.end)
         yield partial(_moves_of_loops, kept, nodes)
