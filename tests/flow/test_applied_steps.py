@@ -4,17 +4,14 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-import numpy as np
 import pytest
-from small_chain import DDS_CORE, EXECUTOR_CORE
+from chain_in_step import MS, chain_in_step_plan, chain_in_step_text
 
 from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow.apply import apply_plan
 from chainshaper.linux.scheduling import may_use_fifo
-from chainshaper.planning import plan_shaping
-from chainshaper.planning.chain_plan import LoopAge, PlannedLoop, publish_slots, revised
 from chainshaper.planning.plan import Plan
 from chainshaper.reporting.overviews import servers_table
 from chainshaper.sources.preload import in_front, installed_library, named_loops
@@ -28,61 +25,16 @@ pytestmark = [
     pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here"),
 ]
 
-MS = 1_000_000
-TEXT = f"""\
-name: in step
-chain: /scan../command
-scheduling:
-  executors: {{core: {EXECUTOR_CORE}, priority: 80}}
-  dds: {{core: {DDS_CORE}, priority: 90}}
-nodes:
-  sensor: {{callbacks: [{{timer: 50ms, execution: {{uniform: [1ms, 3ms]}}, publishes: [/scan]}}]}}
-  controller:
-    callbacks:
-      - loop: 10ms
-        phase: 1ms
-        reads: [/scan]
-        execution: {{constant: 500us}}
-        publishes: [/command]
-  driver: {{callbacks: [{{subscription: /command, execution: {{constant: 10us}}}}]}}
-"""
-
-
-def planned(moves: Any) -> Plan:
-    chain = plan_shaping(
-        np.array([3 * MS, 20 * MS]),
-        50 * MS,
-        spec="/scan..",
-        output="/scan",
-        publisher="/sensor",
-        nodes=("/sensor",),
-    )
-    start = publish_slots(chain)[0][0]
-    loop = PlannedLoop(
-        node="/controller",
-        thread=LOOP_NAME,
-        topic="/scan",
-        period_ns=10 * MS,
-        samples=1,
-        delivery_ns=(0, MS, MS),
-        lead_ns=2 * MS,
-        in_step=moves,
-        starts_ns=(start, start + 15 * MS) if moves == "output" else None,
-        move_ns=0 if moves == "loop" else None,
-        age=LoopAge(first_ns=(0, 0), every_ns=(0, 0), constant=True, uses=(5, 5)),
-    )
-    return Plan.of(revised(chain, loop=loop))
-
 
 @pytest.mark.parametrize(
     ("moves", "beneath"), [("loop", True), ("output", True), ("output", False), ("loop", False)]
 )
 def test_an_applied_plan_keeps_output_and_loop_in_step(
-    tmp_path: Path, moves: str, beneath: bool
+    tmp_path: Path, moves: Literal["output", "loop"], beneath: bool
 ) -> None:
     """Beneath the library and, where only the output is moved, without it."""
-    (tmp_path / "app.yaml").write_text(TEXT)
-    plan = planned(moves)
+    (tmp_path / "app.yaml").write_text(chain_in_step_text())
+    plan = Plan.of(chain_in_step_plan(moves))
     application = splice_application(load_application(tmp_path / "app.yaml"), plan)
     front = {}
     if beneath:

@@ -5,73 +5,24 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from small_chain import DDS_CORE, EXECUTOR_CORE
+from chain_in_step import LEAD, LOOP, MS, chain_in_step_plan, chain_in_step_text
 
 import chainshaper as cs
-from chainshaper.planning import ChainPlan, plan_shaping
-from chainshaper.planning.chain_plan import LoopAge, PlannedLoop, publish_slots, revised
 from chainshaper.planning.plan import Plan
 from chainshaper.values.event_declarations import LOOP_MOVES
 from chainshaper.values.recording import Recording
 
 pytestmark = pytest.mark.timed
 
-MS = 1_000_000
-SENSOR, LOOP, LEAD = 50 * MS, 10 * MS, 2 * MS
 CYCLES = 160
 SETTLED = 4_000 * MS
-TEXT = f"""\
-name: in step
-chain: /scan../command
-scheduling:
-  executors: {{core: {EXECUTOR_CORE}, priority: 80}}
-  dds: {{core: {DDS_CORE}, priority: 90}}
-nodes:
-  sensor: {{callbacks: [{{timer: 50ms, execution: {{uniform: [1ms, 3ms]}}, publishes: [/scan]}}]}}
-  controller:
-    callbacks:
-      - loop: 10ms
-        phase: 1ms
-        priority: 85
-        reads: [/scan]
-        execution: {{constant: 500us}}
-        publishes: [/command]
-  driver: {{callbacks: [{{subscription: /command, execution: {{constant: 10us}}}}]}}
-"""
-
-
-def planned(moves: Literal["output", "loop"]) -> ChainPlan:
-    chain = plan_shaping(
-        np.array([3 * MS, 20 * MS]),
-        SENSOR,
-        spec="/scan..",
-        output="/scan",
-        publisher="/sensor",
-        nodes=("/sensor",),
-    )
-    start = publish_slots(chain)[0][0]
-    loop = PlannedLoop(
-        node="/controller",
-        thread="loop",
-        topic="/scan",
-        period_ns=LOOP,
-        samples=1,
-        delivery_ns=(0, MS, MS),
-        lead_ns=LEAD,
-        in_step=moves,
-        starts_ns=(start, start + 15 * MS) if moves == "output" else None,
-        move_ns=3 * MS if moves == "loop" else None,  # as it was in a recording
-        age=LoopAge(first_ns=(0, 0), every_ns=(0, 0), constant=True, uses=(5, 5)),
-    )
-    return revised(chain, loop=loop)
 
 
 def run(folder: Path, moves: Literal["output", "loop"]) -> Recording:
-    (folder / "app.yaml").write_text(TEXT)
+    (folder / "app.yaml").write_text(chain_in_step_text(priority=85))
     application = cs.load_application(folder / "app.yaml")
-    return cs.shape_application(
-        application, Plan.of(planned(moves)), folder / "live", cycles=CYCLES, realtime=None
-    )
+    plan = Plan.of(chain_in_step_plan(moves, move_ns=3 * MS))
+    return cs.shape_application(application, plan, folder / "live", cycles=CYCLES, realtime=None)
 
 
 def usual_lead(recording: Recording) -> float:
