@@ -2,10 +2,7 @@
 its slot, and pipelines of stages.
 """
 
-import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -179,53 +176,6 @@ def _overrunning(folder: Path, slot_ends: SlotEnds) -> tuple[Application, ChainP
     plan = small_chain_plan(4 * MS, 24 * MS, core=EXECUTOR_CORE)
     slots = {"chain": [(0, 14 * MS)], "output": [(25 * MS, 26 * MS)]}
     return application, revised(plan, servers=with_slots(plan.servers, slots), slot_ends=slot_ends)
-
-
-# A thread of the highest priority takes a core for 15 ms of some 37: at any instant of a cycle.
-HOLDING = """
-import os, time
-os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(99))
-os.sched_setaffinity(0, {CORE})
-parent = os.getppid()
-while os.getppid() == parent:
-    time.sleep(0.0221)
-    until = time.monotonic() + 0.015
-    while time.monotonic() < until:
-        pass
-"""
-
-
-@contextmanager
-def core_held_now_and_then(core: int) -> Iterator[None]:
-    holder = subprocess.Popen([sys.executable, "-c", HOLDING.replace("CORE", str(core))])
-    try:
-        yield
-    finally:
-        holder.kill()
-        holder.wait()
-
-
-@pytest.mark.skipif(len(available_cores()) < 2, reason="needs two cores")
-def test_a_free_gate_goes_on_on_another_core_while_its_own_is_held(tmp_path: Path) -> None:
-    """Kept in its server, it waits there as long as the core is held."""
-    held = dict[str, float]()
-    for thread in ("free", "in-slots"):
-        plan = small_chain_plan(
-            10 * MS, 30 * MS, core=EXECUTOR_CORE, overrun="publish", shaping_thread=thread
-        )
-        assert plan.shaping_node is not None
-        assert plan.shaping_node.core == EXECUTOR_CORE
-        with core_held_now_and_then(EXECUTOR_CORE):
-            recording = shape_application(
-                small_chain(tmp_path), Plan.of(plan), tmp_path / thread, cycles=120
-            )
-        gate = recording.events["gate_release"]
-        in_time = gate.filter(pl.col("arrival") < pl.col("release"))
-        assert in_time.height > 60
-        behind = in_time["time"] - in_time["release"]
-        held[thread] = (behind > 2 * MS).mean()
-    assert held["in-slots"] > 0.2
-    assert held["free"] < 0.05, "stalls of the machine itself may hold it"
 
 
 def test_closed_servers_of_a_described_application_gate_its_executors(tmp_path: Path) -> None:

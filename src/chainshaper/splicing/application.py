@@ -231,10 +231,5 @@ def _described(plan: ChainPlan, shaping: ShapingNode, depth: int, phase_ns: int)
             publishes=(shaping.output,),
             gate=GateDescription.model_validate(described),
         )
-        return NodeDescription(
-            core=shaping.core,
-            priority=shaping.fifo_priority,
-            callbacks=(callback,),
-            # An output that waits for an instant would wait behind whatever holds its core then.
-            bound=plan.shaping_thread == "in-slots",
-        )
+        core, priority = shaping.core, shaping.fifo_priority
+        return NodeDescription(core=core, priority=priority, callbacks=(callback,))

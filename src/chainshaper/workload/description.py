@@ -348,9 +348,8 @@ class NodeDescription(Part):
     """A node in a process of its own.
 
     * ``core``, ``priority``, ``dds_priority``: instead of those in ``scheduling``.
-    * ``bound``: whether it stays on its core. If not, it runs on any core in a live run, and moves
-      to another where a more urgent thread takes the one that it is on; in a simulation it runs on
-      its core all the same.
+    * ``bound``: whether it stays on its core. If not, it runs on any core in a live run; in a
+      simulation it runs on its core all the same.
     * ``threads``: of a multi-threaded executor. They stay on the ``cores`` in turn, or all on
       ``core``.
     * ``callback_groups``: of a mutually exclusive group, callbacks run one at a time; of a
@@ -565,12 +564,8 @@ class Application(Part):
         return Scheduling(core=core, priority=loop.priority or executor.priority)
 
     def cores(self) -> dict[int, str]:
-        """Return every core that threads of the application are meant for, and what asks for it.
-
-        Of nodes that run on any core only shaping nodes count: their core is one of the plan's.
-        """
-        gates = {name for name, callback in self.callbacks() if callback.gate is not None}
-        bound = [name for name, node in self.nodes.items() if node.bound or name in gates]
+        """Return every core that threads of the application are bound to, and what asks for it."""
+        bound = [name for name, node in self.nodes.items() if node.bound]
         executors = {core: f"node {name}" for name in bound for core in self.cores_of(name)}
         loops = {
             loop.core: f"the loop of node {name}"
