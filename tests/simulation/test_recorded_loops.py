@@ -16,7 +16,7 @@ from chainshaper.analysis.chains import find_chain
 from chainshaper.analysis.graph import graph_of
 from chainshaper.flow.plan import plan_recording, profile_chains
 from chainshaper.flow.recorded_processes import recorded_processes
-from chainshaper.flow.recorded_profile.loops import before_loop, phase_of
+from chainshaper.flow.recorded_profile.loops import before_loop, on_time, phase_of
 from chainshaper.simulation import simulate
 from chainshaper.sources import open_source
 from chainshaper.values.application import Chain
@@ -50,6 +50,33 @@ def test_phase_and_jitter_are_those_of_the_starts(
 
     assert apart(phase.phase_ns) <= 0.02 * jitter_us * US + 5 * US
     assert abs(phase.jitter_ns - jitter_us * US) <= 0.06 * jitter_us * US + 5 * US
+
+
+@pytest.mark.parametrize("drift", [0.0, 50e-6, -300e-6])
+def test_late_starts_are_no_drift(drift: float) -> None:
+    """A loop that is late by more and more, and skips instances then, is where it was behind that.
+
+    Followed from start to start it is a period further each time.
+    """
+    due = np.arange(0, 19_900 * MS, 10 * MS, dtype=np.int64)
+    due = 3 * MS + (due * (1 - drift)).astype(np.int64)
+    late = np.zeros(len(due), np.int64)
+    for stall in range(200, 1700, 400):
+        late[stall : stall + 3] = 3 * MS, 6 * MS, 9 * MS
+    kept = np.delete(np.arange(len(due)), np.arange(203, 1700, 400))
+    phase = phase_of((due + late)[kept], CYCLES, 10 * MS)
+    assert phase.drift_ppm == pytest.approx(drift * 1e6, abs=0.5)
+    assert phase.phase_ns == pytest.approx(int(due[-1]) % (10 * MS), abs=10 * US)
+    assert phase.jitter_ns <= 50 * US, "8 of 1986 starts are late, or early as the next one: 0.4 %"
+
+
+def test_late_beginnings_of_cycles_are_put_where_they_are_due() -> None:
+    due = 5 * MS + (np.arange(0, 20_000 * MS, 20 * MS) * 1.00005).astype(np.int64)
+    late = np.zeros(len(due), np.int64)
+    late[::50] = 4 * MS
+    assert np.abs(on_time(due + late, 20 * MS) - due).max() <= 1 * US
+    irregular = np.sort(np.random.default_rng(3).integers(0, 20_000 * MS, 900))
+    assert (on_time(irregular, 20 * MS) == irregular).all()
 
 
 def test_starts_without_a_usual_phase_have_their_period_as_jitter() -> None:

@@ -5,7 +5,7 @@ node stores.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,8 @@ from chainshaper.values.recording import Recording
 _FEWEST = 20  # instances, or deliveries, of which a share can be told
 _SIGNIFICANT = 6.0  # standard errors by which a drift differs from none
 _LEAST_DRIFT_NS = 20_000  # in the recording: less may come of wake-ups
+_REFINED = 3  # times: starts that are not near the line at first are not near the next
+_LARGEST_DRIFT = 2e-3  # of two quartzes, or of a timer that a program counts itself
 _Times = npt.NDArray[np.int64]
 
 
@@ -73,7 +75,6 @@ def recorded_loop(
             f"{recording.path}: {loop.label} has {len(starts)} instances, too few to plan with:"
             " record longer"
         )
-    begun = whole.traversals["start"].unique().sort().to_numpy()
     threads = set(instances["tid"])
     known = [
         thread
@@ -90,8 +91,7 @@ def recorded_loop(
         measured["intervals_ns"] = tuple(round(float(value)) for value in apart)
     else:
         measured["period_ns"] = loop.period_ns
-        phase = phase_of(starts, begun, math.gcd(loop.period_ns, period_ns))
-        measured |= phase._asdict()
+        measured |= _phase_in_calm_cycles(whole, starts, loop.period_ns, period_ns)._asdict()
     took = pl.coalesce("execution_ns", pl.col("end") - pl.col("start")).fill_null(0)
     in_cycles = instances.group_by(pl.col("start") // period_ns).agg(
         together=took.sum(), longest=took.max()
@@ -114,6 +114,22 @@ def recorded_loop(
     )
 
 
+def _phase_in_calm_cycles(
+    whole: LatencyAnalysis, starts: _Times, loop_ns: int, cycle_ns: int
+) -> "Phase":
+    """Return the phase of the loop's starts in cycles that the machine did not disturb.
+
+    Where it disturbed nearly all, it is that of all starts.
+    """
+    begun = whole.traversals["start"].unique().sort().to_numpy()
+    calm = whole.traversals.filter(~pl.col("disturbed"))["start"].unique().to_numpy()
+    places = np.searchsorted(begun, starts, side="right") - 1
+    in_calm = (places >= 0) & np.isin(begun[np.maximum(places, 0)], calm)
+    if in_calm.sum() >= _FEWEST:
+        starts = starts[in_calm]
+    return phase_of(starts, on_time(begun, cycle_ns), math.gcd(loop_ns, cycle_ns))
+
+
 class Phase(NamedTuple):
     """When instances start behind the cycles of a chain; see `PlannedLoop`."""
 
@@ -126,31 +142,93 @@ def phase_of(starts: _Times, cycles: _Times, common_ns: int) -> Phase:
     """Return the phase of starts behind cycles, modulo ``common_ns``; all times in ns, ascending.
 
     Where the two clocks drift apart, it is the phase at the end, and the jitter around the drift.
+    Starts that are late, by more than half of ``common_ns`` or several in turn, are no drift.
     """
     places = np.searchsorted(cycles, starts, side="right") - 1
     behind = (starts - cycles[np.maximum(places, 0)])[places >= 0]
     starts = starts[places >= 0]
-    angles = np.exp(2j * np.pi * (behind % common_ns) / common_ns)
-    # Unwrapped around the starts before, as a drift may take them round several times.
-    unwrapped = np.unwrap(np.angle(angles)) / (2 * np.pi) * common_ns
-    elapsed = (starts - starts[-1]).astype(np.float64)
-    slope, at_end = np.polyfit(elapsed, unwrapped, 1)
-    rest = unwrapped - (at_end + slope * elapsed)
-    drifted = abs(slope) * -elapsed[0]
-    error = float(np.std(rest)) * math.sqrt(12 / len(rest))
-    if drifted < max(_SIGNIFICANT * error, _LEAST_DRIFT_NS):
-        usual = round(float(np.median(unwrapped)))
-        slope, at_end = 0.0, float(usual)
-        rest = (behind - usual + common_ns // 2) % common_ns - common_ns // 2  # whole ns
-    if np.subtract(*np.percentile(rest, (75, 25))) > common_ns / 4:  # there is no usual phase
+    line = _line_through(behind, starts - starts[-1], common_ns)
+    if line is None:  # there is no usual phase
         return Phase(0, common_ns, 0.0)
+    drift, at_end, rest = line.drift, line.at_end, line.rest
+    if not line.is_significant:
+        drift, at_end = 0.0, float(round(at_end))
+        rest = _around(behind, round(at_end), common_ns)  # whole ns
     early, late = np.percentile(rest, (0.5, 99.5))
     jitter = min(math.ceil(float(late)) - math.floor(float(early)), common_ns)
     return Phase(
         phase_ns=math.floor(at_end + float(early)) % common_ns,
         jitter_ns=jitter,
-        drift_ppm=round(-float(slope) * 1e6, 3) + 0.0,  # never -0.0
+        drift_ppm=round(-drift * 1e6, 3) + 0.0,  # never -0.0
     )
+
+
+def on_time(cycles: _Times, cycle_ns: int) -> _Times:
+    """Return when cycles (ns, ascending) would have begun if none of them had been late.
+
+    A gate counts its slots from there. Cycles without a usual phase are returned as they are.
+    """
+    line = _line_through(cycles - cycles[0], cycles - cycles[-1], cycle_ns)
+    return cycles if line is None else cycles - np.rint(line.rest).astype(np.int64)
+
+
+class _Line(NamedTuple):
+    """Where places are that repeat, and drift."""
+
+    drift: float  # ns per ns
+    at_end: float  # the usual place at the end, ns
+    rest: npt.NDArray[np.float64]  # how far from the line places are
+    is_significant: bool  # whether the drift differs from none
+
+
+def _line_through(places: _Times, elapsed: _Times, common_ns: int) -> _Line | None:
+    """Return the line through places that repeat every ``common_ns``; None: they have no usual one.
+
+    ``elapsed`` is when each was seen, up to 0 at the end.
+    """
+    drift, at_end = _usual_drift(places, elapsed, common_ns)
+    error = math.inf
+    for _ in range(_REFINED):
+        rest = _around(places - drift * elapsed, at_end, common_ns)
+        usual, spread = np.median(rest), np.subtract(*np.percentile(rest, (75, 25)))
+        if spread > common_ns / 4:
+            return None
+        near = np.abs(rest - usual) <= max(4 * spread, _LEAST_DRIFT_NS)
+        slope, moved = np.polyfit(elapsed[near].astype(np.float64), rest[near], 1)
+        error = float(np.std((rest - moved - slope * elapsed)[near])) * math.sqrt(12 / near.sum())
+        drift, at_end = drift + float(slope), at_end + float(moved)
+    rest = _around(places - drift * elapsed, at_end, common_ns)
+    drifted = abs(drift) * -float(elapsed[0])
+    return _Line(drift, at_end, rest, drifted >= max(_SIGNIFICANT * error, _LEAST_DRIFT_NS))
+
+
+def _usual_drift(behind: _Times, elapsed: _Times, common_ns: int) -> tuple[float, float]:
+    """Return the drift (ns per ns) at which most places agree, and where they are at the end (ns).
+
+    Places repeat every ``common_ns``, so each is a direction. At the right drift directions agree,
+    however late a few of them are; a line through the places would follow these. The frequency of
+    the greatest sum of directions is sought, in bins of time that are short beside a turn of the
+    largest drift, and with zeros behind them, so that frequencies lie closely: the
+    drift is right to a sixteenth of ``common_ns`` over all.
+    """
+    lasted = int(-elapsed[0]) + 1
+    turns = math.ceil(_LARGEST_DRIFT * lasted / common_ns) + 1  # at the largest drift
+    bins = 1 << (8 * turns).bit_length()
+    directions = np.exp(2j * np.pi * (behind % common_ns) / common_ns)
+    binned = np.zeros(8 * bins, complex)
+    np.add.at(binned, (elapsed + lasted - 1) * bins // lasted, directions)
+    sums = np.fft.fft(binned)
+    frequencies = np.fft.fftfreq(len(binned), lasted / bins)  # turns per ns
+    possible = np.flatnonzero(np.abs(frequencies) * common_ns <= _LARGEST_DRIFT)
+    best = possible[np.argmax(np.abs(sums[possible]))]
+    drift = float(frequencies[best]) * common_ns
+    mean = (directions * np.exp(-2j * np.pi * drift * elapsed / common_ns)).sum()
+    return drift, float(np.angle(mean)) / (2 * np.pi) * common_ns
+
+
+def _around(places: npt.NDArray[Any], center: float, common_ns: int) -> npt.NDArray[Any]:
+    """Return how far from ``center`` places are, which repeat every ``common_ns``."""
+    return (places - center + common_ns // 2) % common_ns - common_ns // 2
 
 
 class _Stored(NamedTuple):
