@@ -431,6 +431,32 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
     assert set(_by_tid(plan_scheduling(alone, allocation, (0, 1)))) == {100, 200}
 
 
+def test_receivers_of_one_process_take_turns_and_stand_below_its_loop() -> None:
+    """As the executors of a ros2_control node, whose loop has priority 50 by itself."""
+    node = GATE.model_copy(update={"receivers": ("/sink",)})
+    chain = _server("chain", EXECUTOR_A, priority=2)
+    bare = _plan(chain, _server("output", node.thread, priority=1, start=1)).chains[0]
+    loop = PlannedLoop(
+        node="/sink",
+        topic="/out",
+        period_ns=10 * MS,
+        samples=1,
+        delivery_ns=(0, 0, 0),
+        lead_ns=0,
+        realtime_priority=50,
+        age=LoopAge(first_ns=(0, 0), every_ns=(0, 0), constant=True, uses=(1, 1)),
+    )
+    nodes = _node("/gate", 100, "executor"), _node("/a", 200, "executor")
+    sink = _node("/sink", 300, "executor", "executor")
+    for read_by, priority in ((None, 83), (loop, 49)):
+        plan = Plan.of(revised(bare, shaping_node=node, loop=read_by))
+        wanted = _by_tid(plan_scheduling(plan, _allocation(*nodes, sink), (0, 1)))
+        assert wanted[300] == wanted[301] == SchedulingRequest(priority, (1,), takes_turns=True)
+        assert wanted[300].policy == os.SCHED_RR
+        alone = _by_tid(plan_scheduling(plan, _allocation(*nodes, sink[:1]), (0, 1)))
+        assert alone[300] == SchedulingRequest(priority, (1,)), "nothing else has its place"
+
+
 def test_receivers_with_a_place_stand_above_the_chain_and_behind_its_gates() -> None:
     """87 and 86 for outputs, and 84 for the chain, with room for publishers in between."""
     place = ReceiverPlace(core=1, priority=1, time_ns=MS)

@@ -4,14 +4,17 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Literal
+from types import SimpleNamespace
+from typing import Any, Literal, cast
 
 import pytest
 from chain_in_step import MS, chain_in_step_plan, chain_in_step_text
 
 from chainshaper.enforcement.undoing import RunState
+from chainshaper.flow import apply
 from chainshaper.flow.apply import apply_plan
 from chainshaper.linux.scheduling import may_use_fifo
+from chainshaper.planning.chain_plan import ChainPlan, revised
 from chainshaper.planning.plan import Plan
 from chainshaper.reporting.overviews import servers_table
 from chainshaper.sources.preload import in_front, installed_library, named_loops
@@ -96,3 +99,41 @@ def test_an_applied_plan_keeps_output_and_loop_in_step(
     if moves == "output":
         moved = recording.events["gate_release"]["moved"].unique().sort().to_list()
         assert moved[0] == 0 and first.moved_ns in moved
+
+
+def test_outputs_to_be_moved_are_waited_for_until_they_have_gates(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A shaping node runs before it has found a publisher: `shape -- ros2 launch` ended there."""
+    plan = Plan.of(chain_in_step_plan("output"))
+    thread = SimpleNamespace(thread=SimpleNamespace(pid=7))
+    run = SimpleNamespace(
+        anchored=SimpleNamespace(given=plan),
+        threads=SimpleNamespace(find=lambda _: SimpleNamespace(threads=[thread])),
+        command_has_ended=False,
+        stop=threading.Event(),
+        go_on=lambda: None,
+    )
+    looks = list[Any]()
+
+    def gates_of(topic: str, pids: set[int]) -> list[str]:
+        looks.append((topic, pids))
+        return ["its gate"] if len(looks) == 3 else []
+
+    monkeypatch.setattr(apply, "gates_of", gates_of)
+    minute_ns = 60_000_000_000
+    apply._await_gates(cast(Any, run), {}, minute_ns, lambda *_: None)
+    assert looks == [("/scan", {7})] * 3
+    apply._await_gates(cast(Any, run), {}, 0, lambda *_: None)  # what follows says what is missing
+    assert len(looks) == 4
+    apply._await_gates(
+        cast(Any, SimpleNamespace(anchored=SimpleNamespace(given=Plan.of(unmoved())))),
+        {},
+        minute_ns,
+        lambda *_: None,
+    )
+    assert len(looks) == 4, "nothing is to be moved"
+
+
+def unmoved() -> ChainPlan:
+    return revised(chain_in_step_plan("output"), loop=None)

@@ -195,6 +195,30 @@ def test_a_timer_that_comes_earlier_is_not_counted_twice(
     assert moved_ns + known(watch.surely_ns) == -MS // 2
 
 
+def test_a_look_during_which_slots_moved_is_soon_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Slots open earlier until their timer is seen: seconds, not two times ten of them."""
+    expected_by, watches = list[int](), list[DriftWatch]()
+
+    def look(_: DriftWatch, _near: int | None, expected: int) -> int:
+        expected_by.append(expected)
+        if len(expected_by) == 2:
+            watches[0].expect(expected - MS)  # slots move meanwhile
+        if len(expected_by) == 3:
+            raise OperationError("the thread has ended")
+        return 0
+
+    monkeypatch.setattr(DriftWatch, "_look", look)
+    monkeypatch.setattr(DriftWatch, "EVERY_S", 1e6)
+    monkeypatch.setattr(DriftWatch, "SOON_S", 0.01)
+    watches.append(DriftWatch(1, [1], 100 * MS, 48 * MS))
+    watches[0].look_soon = True
+    wait_for(lambda: watches[0].looks == 1, "the first look")
+    watches[0].look_soon = True
+    wait_for(lambda: len(expected_by) == 3, "the look to be repeated")
+    assert expected_by == [48 * MS, 48 * MS, 47 * MS]
+    assert watches[0].looks == 1, "what was seen while slots moved counts for nothing"
+
+
 def test_a_run_that_is_to_end_while_its_slots_move_has_not_failed(tmp_path: Path) -> None:
     """Re-arming waits for answers; asked to end meanwhile, it gives up with an error of its own."""
 

@@ -786,7 +786,9 @@ def _show_shaped_launch(
         if shaped.splicing is not None:
             launch = next(iter(shaped.splicing.launch.values()))
             plan = shaped.folder / "plan.yaml"
-            out.show_line(f"  Keep it so  chainshaper apply {plan} -- ros2 launch {launch}")
+            sourced = "" if shaped.setup is None else f"source {shaped.setup}; "
+            applied = f"chainshaper apply {plan} -- ros2 launch {launch}"
+            out.show_line(f"  Keep it so  {sourced}{applied}")
     judge(shaped.comparisons, strict=strict, json=True)
 
 

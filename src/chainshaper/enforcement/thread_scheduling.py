@@ -16,7 +16,11 @@ SCHED_FIFO priorities (DESIGN section 6). From the most urgent:
 * nodes that receive what a shaping node publishes. Where the plan has a place for them, that is
   behind the shaping nodes and above everything else there. Otherwise they are below all servers, on
   the shaping node's core or, in a plan of several chains, whose servers keep that core busy, on the
-  first core without servers;
+  first core without servers; and below a loop of their process that reads the output and has raised
+  itself, as ros2_control's, which must not wait for its own node's executors. Several threads of a
+  process on one core take turns: a thread of rclcpp's multi-threaded executor calls for work
+  without pause while another one runs a callback of the group that has some, and, as urgent as
+  that, would never let it go on once it has waited for a lock;
 * the thread of a loop that reads an output, at the place that the plan has for it, unless it has a
   real-time priority by itself;
 * an asynchronous publisher, below every other thread of its process on its core: it spins on the
@@ -28,6 +32,7 @@ SCHED_FIFO priorities (DESIGN section 6). From the most urgent:
 All other threads are left alone.
 """
 
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain as joined
@@ -107,6 +112,7 @@ def plan_scheduling(
         take_turns=plan.takes_turns,
         clear={node.core for node in plan.shaping_nodes},
         loops=planned_loops(plan),
+        raised_loops=_raised_loops(plan),
     )
 
 
@@ -117,6 +123,15 @@ def planned_loops(plan: Plan) -> list[tuple[PlannedLoop, ReceiverPlace]]:
         for chain in plan.chains
         if chain.loop is not None and chain.loop.runs_at is not None
     ]
+
+
+def _raised_loops(plan: Plan) -> dict[str, int]:
+    """Return the real-time priorities that loops that read outputs gave themselves, by node."""
+    return {
+        chain.loop.node: chain.loop.realtime_priority
+        for chain in plan.chains
+        if chain.loop is not None and chain.loop.realtime_priority is not None
+    }
 
 
 def waiting_receivers(plan: Plan, wanted: Iterable[WantedScheduling]) -> list[str]:
@@ -150,6 +165,7 @@ def scheduling_around(
     take_turns: bool = False,
     clear: Collection[int] = (),
     loops: Sequence[tuple[PlannedLoop, ReceiverPlace]] = (),
+    raised_loops: Mapping[str, int] = MappingProxyType({}),
 ) -> tuple[WantedScheduling, ...]:
     """Return what the threads of servers, and the other threads of their processes, get.
 
@@ -165,6 +181,7 @@ def scheduling_around(
     * ``take_turns``: whether servers of one priority share it by turns (SCHED_RR).
     * ``loops``: loops that read an output, each with the place of its thread. A thread that has
       raised itself stays as it is.
+    * ``raised_loops``: nodes whose loop has given itself a real-time priority, and this.
     * ``clear``: the cores that DDS threads leave where all cores have servers; otherwise they leave
       all cores with servers.
 
@@ -202,6 +219,7 @@ def scheduling_around(
         priorities=priorities,
         available_cores=available_cores,
         busy=busy,
+        raised_loops=raised_loops,
     )
     receiving += _looping(allocation, planned, loops, priorities, available_cores)
     planned |= {item.node_thread.thread.identity for item in receiving}
@@ -268,6 +286,7 @@ def _receiving(
     priorities: Mapping[int, Sequence[int]],
     available_cores: Collection[int],
     busy: Collection[int],
+    raised_loops: Mapping[str, int],
 ) -> tuple[list[WantedScheduling], set[int]]:
     """Return what executors of nodes that receive an output get, and their processes' ids.
 
@@ -281,7 +300,8 @@ def _receiving(
             continue
         pids.add(listed.thread.pid)
         place = next((places[node] for node in listed.nodes if node in places), None)
-        priority, reason = below, _RECEIVES
+        loops = [raised_loops[node] - 1 for node in listed.nodes if node in raised_loops]
+        priority, reason = max(1, min([below, *loops])), _RECEIVES
         if place is not None and place.priority in priorities:
             priority, reason = priorities[place.priority][-1], _RECEIVES_IN_PLACE
             core = place.core if place.core in available_cores else core
@@ -289,7 +309,18 @@ def _receiving(
         if not is_placed or not set(busy).isdisjoint(listed.thread.cores):
             request = SchedulingRequest(priority, (core,))
             receiving.append(WantedScheduling(listed, request, None, reason))
-    return receiving, pids
+    return _taking_turns(receiving), pids
+
+
+def _taking_turns(receiving: Sequence[WantedScheduling]) -> list[WantedScheduling]:
+    """Have threads of one process that share a core at one priority take turns."""
+    sharing = Counter((item.node_thread.thread.pid, item.scheduling) for item in receiving)
+    return [
+        replace(item, scheduling=replace(item.scheduling, takes_turns=True))
+        if sharing[item.node_thread.thread.pid, item.scheduling] > 1
+        else item
+        for item in receiving
+    ]
 
 
 def _looping(

@@ -12,7 +12,7 @@ import os
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -57,7 +57,7 @@ from chainshaper.linux.scheduling import check_cores
 from chainshaper.planning.offsets import LEAD_NS, chain_name
 from chainshaper.planning.overruns import publication_warnings
 from chainshaper.planning.plan import Plan
-from chainshaper.splicing.shaped_outputs import remove_abandoned_pages
+from chainshaper.splicing.shaped_outputs import gates_of, remove_abandoned_pages
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import OperationError
 from chainshaper.values.progress import Progress
@@ -102,8 +102,9 @@ def apply_plan(
     else none). ``phase_ns`` is where in a cycle the first chain's timer expires, on CLOCK_MONOTONIC
     (None: those of all chains are measured). With ``adapt`` slots follow the latencies, to no later
     end than ``max_latency_ns`` (None: as the plan says). Where the plan has a loop in step, the
-    output's slots, or the loop, are moved so that they are. ``recording`` is one of the very
-    processes, or of an earlier run (None: those that the plan names); ``users`` are as for
+    output's slots, or the loop, are moved so that they are, and a command is started beneath the
+    library that sees how loops sleep. ``recording`` is one of the very processes, or of an earlier
+    run (None: those that the plan names); ``users`` are as for
     :func:`.find_threads`. ``watch`` gets the state every second; ``folder`` is where runs stand
     (default: `/run/chainshaper`).
 
@@ -136,7 +137,8 @@ def apply_plan(
     try:
         run.guardians = Guardians(journal)
         if command:
-            run.command = start_command(command, stdout=command_stdout)
+            in_front = _in_front_of_loops(plan)
+            run.command = start_command(command, in_front, stdout=command_stdout)
         await_nodes(
             run_threads,
             plan,
@@ -172,6 +174,7 @@ def apply_plan(
         )
         _arm(supervision, progress)
         report.note(*why_not)
+        _await_gates(supervision, reaches_ns, wait_ns, progress)
         followers.start(run_threads.latest, reaches_ns)
         run.loops.start(anchored, run_threads.latest)
         supervision.watch_over(watch)
@@ -194,6 +197,21 @@ def _followed(
     """
     loops_in_step(plan, adapt)
     return followed_chains(plan, back_end, max_latency_ns) if adapt else (plan, {}, [])
+
+
+def _in_front_of_loops(plan: Plan) -> dict[str, str]:
+    """Return the variables by which what we start can be seen to sleep, and be moved.
+
+    Empty: no loop of the plan is in step with an output.
+    """
+    nodes = [loop.node for _, _, loop in loops_in_step(plan)]
+    if not nodes:
+        return {}
+    from chainshaper.sources.preload import in_front, installed_library, named_loops
+
+    before = os.environ.get(named_loops.VARIABLE, "").split(",")
+    names = list(dict.fromkeys(filter(None, [*before, *nodes])))
+    return {**in_front(installed_library()), **named_loops.variables(names)}
 
 
 @dataclass
@@ -317,3 +335,26 @@ def _arm(run: Supervision, progress: Progress) -> None:
     anchored.save(run.report.folder)
     in_force_ns = since_ns + (anchor_ns - since_ns) % cycle_ns
     run.report.state = replace(run.report.state, anchor_ns=anchor_ns, in_force_ns=in_force_ns)
+
+
+def _await_gates(
+    run: Supervision, reaches_ns: Mapping[int, tuple[int, int]], wait_ns: int, progress: Progress
+) -> None:
+    """Wait until the outputs whose slots are to be moved have gates, for this long at most.
+
+    A shaping node runs before it has a gate: that comes when it has found a publisher.
+    """
+    places = {*reaches_ns, *(place for place, *_ in loops_in_step(run.anchored.given))}
+    chains = [run.anchored.given.chains[place] for place in sorted(places)]
+    outputs = [chain.shaping_node.output for chain in chains if chain.shaping_node is not None]
+    begun = time.monotonic_ns()
+    while outputs:
+        listed = run.threads.find(run.anchored.given).threads
+        pids = {each.thread.pid for each in listed}
+        outputs = [output for output in outputs if not gates_of(output, pids)]
+        waited = time.monotonic_ns() - begun
+        if waited >= wait_ns or run.command_has_ended or not outputs:
+            return
+        progress(min(1.0, waited / wait_ns), f"waiting for the gate of {outputs[0]}")
+        run.stop.wait(0.1)
+        run.go_on()

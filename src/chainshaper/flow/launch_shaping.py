@@ -12,6 +12,7 @@ permitted. Chains that would delay each other have recordings of their own.
 
 import sys
 import threading
+import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -26,6 +27,7 @@ from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow import launch_splicing
 from chainshaper.flow.apply import START_NS, apply_plan
 from chainshaper.flow.exploration import list_chains
+from chainshaper.flow.in_step import loops_in_step
 from chainshaper.flow.launch_splicing import Splicing, ThrottledInput
 from chainshaper.flow.plan import profile_chains
 from chainshaper.flow.profiling_condition import (
@@ -43,7 +45,7 @@ from chainshaper.planning.profile import doubts_about
 from chainshaper.reporting.figures import write_comparison
 from chainshaper.reporting.page import write_report
 from chainshaper.splicing.node_kinds import language_of
-from chainshaper.splicing.node_packages import build_package, check_build_tools
+from chainshaper.splicing.node_packages import SETUP, build_package, check_build_tools
 from chainshaper.splicing.shaped_outputs import remove_abandoned_pages
 from chainshaper.splicing.spliced_launch import NODES, LaunchCommand, parse_launch_command
 from chainshaper.values.application import ApplicationGraph
@@ -52,6 +54,7 @@ from chainshaper.values.plan_choices import NodeChoice
 from chainshaper.values.recording import Recording, refuse_existing
 from chainshaper.verify.measure import Comparison, compare_recordings
 
+IN_STEP_NS = 20_000_000_000  # within which loops are in step, or the run says why they are not
 FIRST_LOOK_NS = 10_000_000_000  # long enough for everything to have started and run
 NOT_PERMITTED = "measured under ordinary scheduling: SCHED_FIFO is not permitted."
 
@@ -69,6 +72,14 @@ class ShapedLaunch:
     application: Plan
     comparisons: tuple[Comparison, ...]  # of every chain and sink
     cores: Mapping[str, int]  # where each node's executor ran
+
+    @property
+    def setup(self) -> Path | None:
+        """The file to source before the shaped launch file is launched again; None: none is."""
+        is_built = self.splicing is not None and any(
+            process.package is not None for process in self.splicing.processes
+        )
+        return self.splicing.folder / NODES / SETUP if self.splicing and is_built else None
 
 
 Choose: TypeAlias = Callable[[ApplicationGraph, ChainEnumeration], str]
@@ -482,10 +493,13 @@ def plan_in_force(
 ) -> Iterator[Callable[[Sequence[RunningProcess]], bool]]:
     """Have a thread apply the plan to what runs, until the context ends.
 
-    Yields a function that says whether all servers have opened. At the end the notes of the run
+    Yields a function that says whether all servers have opened, and outputs are in step with their
+    loops, for which it has a while. At the end the notes of the run
     are added to ``notes``.
     """
     stop, states = threading.Event(), list[RunState]()
+    loops = {loop.node for _, _, loop in loops_in_step(plan)}
+    opened_ns: list[int] = []  # when all servers were seen to have opened
     with ThreadPoolExecutor(1, "apply") as beside:
         applied = beside.submit(
             apply_plan,
@@ -508,7 +522,11 @@ def plan_in_force(
                 return False
             state = states[-1]
             ours = [server for server in state.servers if server.kept_by == state.back_end]
-            return all(server.counters.slots for server in ours)
+            if not all(server.counters.slots for server in ours):
+                return False
+            opened_ns.append(time.monotonic_ns())
+            in_step = {step.loop for step in state.steps if step.moved_ns is not None}
+            return loops <= in_step or opened_ns[-1] - opened_ns[0] > IN_STEP_NS
 
         try:
             yield opened

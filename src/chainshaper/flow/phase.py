@@ -296,12 +296,13 @@ class DriftWatch:
                 while time.monotonic() < until and not self.look_soon:
                     if self._stop.wait(self.SOON_S):
                         return
-                self.look_soon = False
+                was_asked, self.look_soon = self.look_soon, False
                 expected_ns = self._expected_ns
                 drift = self._look(near_ns, expected_ns)
                 near_ns = None if drift is None else expected_ns + drift
-                if expected_ns != self._expected_ns:
+                if expected_ns != self._expected_ns:  # slots have moved during the look
                     near_ns = self._expected_ns
+                    self.look_soon |= was_asked
                 elif drift is not None:
                     self._before_ns = self.latest_ns or 0
                     self.latest_ns = drift

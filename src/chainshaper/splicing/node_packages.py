@@ -83,6 +83,9 @@ def check_build_tools() -> None:
         )
 
 
+SETUP = Path("install", "setup.bash")  # in the folder where packages are built: what to source
+
+
 def build_package(folder: Path) -> Path:
     """Build the packages in a folder with colcon; return the file to source.
 
@@ -106,4 +109,4 @@ def build_package(folder: Path) -> Path:
             f"{folder / 'log' / 'latest_build'}. Correct that, or choose"
             f" `--node python`, which needs no building. It ended with:\n{end}"
         )
-    return folder / "install" / "setup.bash"
+    return folder / SETUP

@@ -205,24 +205,31 @@ def ask_phase(topic: str, pids: Collection[int], phase_ns: int) -> None:
         page.ask(Change(time.monotonic_ns(), NEW_PHASE, phase_ns))
 
 
-def _page_of(topic: str, pids: Collection[int]) -> Page:
-    """Open the page of an output that one of these processes publishes.
+def gates_of(topic: str, pids: Collection[int]) -> list[ShapedOutput]:
+    """Return the gates of an output that one of these processes publishes.
 
-    Without processes it is one of this user's.
+    A gate comes into being when its shaping node has found a publisher. Without processes it is
+    one of this user's.
     """
-    of_topic = [output for output in find_outputs() if output.topic == topic]
-    candidates = [
+    return [
         output
-        for output in of_topic
-        if (output.shaping_node in pids if pids else output.user in run_users())
+        for output in find_outputs()
+        if output.topic == topic
         and output.shaping_node
+        and (output.shaping_node in pids if pids else output.user in run_users())
     ]
-    if len(candidates) != 1:
+
+
+def _page_of(topic: str, pids: Collection[int]) -> Page:
+    """Open the page of an output's only gate among these processes; see :func:`gates_of`."""
+    gates = gates_of(topic, pids)
+    if len(gates) != 1:
         raise OperationError(
-            f"slots of {topic} cannot follow: {len(candidates) or 'no'} gates publish it now that"
+            f"slots of {topic} cannot follow: {len(gates) or 'no'} gates publish it now that"
             " show their latencies; start the shaping node, one of this version"
+            f" (and what publishes {topic}: a gate is there when its node has found a publisher)"
         )
-    folder, _, name = candidates[0].page.rpartition("/")
+    folder, _, name = gates[0].page.rpartition("/")
     return Page(folder, name, flags=os.O_RDWR)
 
 
