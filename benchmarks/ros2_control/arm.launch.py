@@ -11,7 +11,7 @@ from launch_ros.actions import Node
 HERE = Path(__file__).resolve().parent
 
 
-def generate_launch_description():
+def generate_launch_description() -> LaunchDescription:
     settings = json.loads(os.environ["ARM"])
     parameters = settings["parameters"]
     manager = ["--controller-manager-timeout", "60", "--param-file", parameters]

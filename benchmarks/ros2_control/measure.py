@@ -24,6 +24,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -36,6 +37,8 @@ from rich.table import Table
 
 import chainshaper as cs
 from chainshaper.analysis import analyse_latency
+from chainshaper.splicing.node_packages import SETUP
+from chainshaper.splicing.spliced_launch import NODES
 
 HERE = Path(__file__).resolve().parent
 MS = 1_000_000
@@ -108,7 +111,11 @@ def main() -> None:
     if "AMENT_PREFIX_PATH" not in os.environ:
         sys.exit("error: source ROS 2 first: source /opt/ros/DISTRO/setup.bash")
     output = chosen.output.resolve()
-    output.mkdir(parents=True, exist_ok=True)
+    if output.exists():
+        parser.error(
+            f"{output} exists: name a folder that does not, so that nothing is overwritten"
+        )
+    output.mkdir(parents=True)
     prefix = build(output)
     for rate in chosen.rate:
         folder = output / f"{rate}_Hz"
@@ -125,10 +132,9 @@ def main() -> None:
             add_recorded(table, name, folder / row / "after", folder, chosen.chain)
             Console(width=150).print(table)
         if chosen.long:
-            known = {*(folder / "notes").iterdir()}
+            began_ns = time.monotonic_ns()
             apply(folder / chosen.rows[-1], chosen.long, environment)
-            (notes,) = {*(folder / "notes").iterdir()} - known
-            turns = np.fromfile(notes, np.int64).reshape(-1, 2)
+            (turns,) = noted(folder, (began_ns, time.monotonic_ns()))
             settled = turns[0, 0] + 30_000 * MS, turns[-1, 0] - 1_000 * MS
             used = used_commands([turns], settled, PERIODS_NS[chosen.chain])
             add_row(table, f"{chosen.rows[-1]}, {chosen.long} s", used)
@@ -188,6 +194,9 @@ def shape(output: Path, options: list[str], seconds: int, environment: dict[str,
 def apply(shaped: Path, seconds: int, environment: dict[str, str]) -> None:
     """Apply a plan to a further start of the shaped launch file, for so long."""
     launch = ["ros2", "launch", "--noninteractive", str(shaped / "launch/arm.launch.py")]
+    setup = shaped / "launch" / NODES / SETUP  # of the shaping node, where it was built
+    if setup.exists():
+        launch = ["bash", "-c", 'source "$0" && exec "$@"', str(setup), *launch]
     words = ["apply", str(shaped / "plan.yaml"), "--", *launch]
     with chainshaper(words, shaped.parent / "apply.log", environment) as run:
         try:
@@ -226,6 +235,19 @@ def used_commands(
     return Used((written - began)[new], uses, int(np.maximum(skipped, 0).sum()))
 
 
+def noted(folder: Path, window_ns: tuple[int, int]) -> list[npt.NDArray[np.int64]]:
+    """Return what the hardware noted in the runs of which a part lies between two instants.
+
+    In rows: when a command was written, and when its chain began (CLOCK_MONOTONIC, ns).
+    """
+    files = sorted((folder / "notes").iterdir())
+    runs = [np.fromfile(file, np.int64).reshape(-1, 2) for file in files]
+    runs = [turns for turns in runs if turns[-1, 0] > window_ns[0] and turns[0, 0] < window_ns[1]]
+    if not runs:
+        sys.exit(f"error: {folder / 'notes'}: the hardware noted nothing between {window_ns}")
+    return runs
+
+
 def new_table(title: str) -> Table:
     table = Table(title=title)
     table.add_column("", no_wrap=True)
@@ -244,10 +266,7 @@ def add_recorded(table: Table, name: str, recording: Path, folder: Path, chain: 
         sys.exit(f"error: {recording}: no turn of the loop was recorded")
     cycles = analysis.data_age.cycles.drop_nulls("traversal").sort("start")
     window = int(cycles["start"][0]), int(cycles["end"][-1])
-    notes = [np.fromfile(file, np.int64).reshape(-1, 2) for file in (folder / "notes").iterdir()]
-    notes = [turns for turns in notes if turns[-1, 0] > window[0] and turns[0, 0] < window[1]]
-    if not notes:
-        sys.exit(f"error: {folder / 'notes'}: the hardware noted nothing during {recording}")
+    notes = noted(folder, window)
     used = used_commands(notes, window, PERIODS_NS[chain])
     first = cycles.filter(use=1)["age_at_end_ns"].to_numpy()
     low, high = np.percentile(first, (0.5, 99.5))
