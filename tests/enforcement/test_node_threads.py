@@ -391,6 +391,16 @@ def test_servers_that_are_scheduling_classes_get_ordinary_threads() -> None:
 
 NUMBERS = {"core": 1, "fifo_priority": 84, "spin_ns": 0, "pause_ns": 0}
 GATE = ShapingNode.model_validate({"name": "gate", "input": "/i", "output": "/out", **NUMBERS})
+SINK_LOOP = PlannedLoop(  # it reads the gate's output
+    node="/sink",
+    thread="control_loop",
+    topic="/out",
+    period_ns=10 * MS,
+    samples=1,
+    delivery_ns=(0, 0, 0),
+    lead_ns=0,
+    age=LoopAge(first_ns=(0, 0), every_ns=(0, 0), constant=True, uses=(1, 1)),
+)
 
 
 def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() -> None:
@@ -436,16 +446,7 @@ def test_receivers_of_one_process_take_turns_and_stand_below_its_loop() -> None:
     node = GATE.model_copy(update={"receivers": ("/sink",)})
     chain = _server("chain", EXECUTOR_A, priority=2)
     bare = _plan(chain, _server("output", node.thread, priority=1, start=1)).chains[0]
-    loop = PlannedLoop(
-        node="/sink",
-        topic="/out",
-        period_ns=10 * MS,
-        samples=1,
-        delivery_ns=(0, 0, 0),
-        lead_ns=0,
-        realtime_priority=50,
-        age=LoopAge(first_ns=(0, 0), every_ns=(0, 0), constant=True, uses=(1, 1)),
-    )
+    loop = SINK_LOOP.model_copy(update={"realtime_priority": 50})
     nodes = _node("/gate", 100, "executor"), _node("/a", 200, "executor")
     sink = _node("/sink", 300, "executor", "executor")
     for read_by, priority in ((None, 83), (loop, 49)):
@@ -478,17 +479,7 @@ def test_receivers_with_a_place_stand_above_the_chain_and_behind_its_gates() -> 
 def test_the_thread_of_a_loop_that_reads_the_output_is_raised_unless_it_raised_itself() -> None:
     """It stands where receivers with a place do, on the core that the plan has for it."""
     place = ReceiverPlace(core=2, priority=1, time_ns=MS)
-    loop = PlannedLoop(
-        node="/sink",
-        thread="control_loop",
-        topic="/out",
-        period_ns=10 * MS,
-        samples=1,
-        delivery_ns=(0, 0, 0),
-        lead_ns=0,
-        runs_at=place,
-        age=LoopAge(first_ns=(0, 0), every_ns=(0, 0), constant=True, uses=(1, 1)),
-    )
+    loop = SINK_LOOP.model_copy(update={"runs_at": place})
     chain = _server("chain", EXECUTOR_A, priority=2)
     bare = _plan(chain, _server("output", GATE.thread, priority=1, start=1)).chains[0]
     gate, first = _node("/gate", 100, "executor"), _node("/a", 200, "executor")

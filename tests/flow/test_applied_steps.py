@@ -17,7 +17,7 @@ from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.planning.chain_plan import ChainPlan, revised
 from chainshaper.planning.plan import Plan
 from chainshaper.reporting.overviews import servers_table
-from chainshaper.sources.preload import in_front, installed_library, named_loops
+from chainshaper.sources.preload import named_loops
 from chainshaper.splicing.application import splice_application
 from chainshaper.workload.description import load_application
 from chainshaper.workload.launcher import LOOP_NAME
@@ -41,8 +41,7 @@ def test_an_applied_plan_keeps_output_and_loop_in_step(
     application = splice_application(load_application(tmp_path / "app.yaml"), plan)
     front = {}
     if beneath:
-        names = named_loops.names_text([LOOP_NAME])
-        front = {**in_front(installed_library()), named_loops.VARIABLE: names}
+        front = named_loops.in_front_of([LOOP_NAME])
     started, over = threading.Event(), threading.Event()
     states = list[RunState]()
 

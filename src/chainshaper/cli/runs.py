@@ -379,12 +379,12 @@ def watch(
     from chainshaper.monitor.budgets import Budget, load_budget
     from chainshaper.monitor.watch import Watch, exporting
     from chainshaper.reporting.overviews import watch_tables
-    from chainshaper.sources.preload import in_front, installed_library, named_loops
+    from chainshaper.sources.preload import named_loops
     from chainshaper.values.recording import refuse_existing
 
-    variables = named_loops.variables(loop or [])
+    named_loops.names_text(loop or [])
     if environment:
-        for name, value in {**in_front(installed_library()), **variables}.items():
+        for name, value in named_loops.in_front_of(loop or []).items():
             out.show_line(f"export {name}={shlex.quote(value)}")
         return
     known = opt.plan_in_force(plan)
@@ -397,7 +397,7 @@ def watch(
     with out.stop_on_signals() as stop, ExitStack() as until:
         started = None
         if command:
-            variables = {**in_front(installed_library()), **variables}
+            variables = named_loops.in_front_of(loop or [])
             started = child_processes.start_command(command, variables, STDERR)
             until.callback(child_processes.end_command, started)
         show = until.enter_context(out.live())

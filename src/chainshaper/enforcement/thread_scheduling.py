@@ -17,10 +17,10 @@ SCHED_FIFO priorities (DESIGN section 6). From the most urgent:
   behind the shaping nodes and above everything else there. Otherwise they are below all servers, on
   the shaping node's core or, in a plan of several chains, whose servers keep that core busy, on the
   first core without servers; and below a loop of their process that reads the output and has raised
-  itself, as ros2_control's, which must not wait for its own node's executors. Several threads of a
-  process on one core take turns: a thread of rclcpp's multi-threaded executor calls for work
-  without pause while another one runs a callback of the group that has some, and, as urgent as
-  that, would never let it go on once it has waited for a lock;
+  itself: ros2_control's loop must not wait for its own node's executors. Several threads of a
+  process on one core take turns. Where a callback of a mutually exclusive group runs and the group
+  has more work, another thread of rclcpp's multi-threaded executor asks for that without pause; at
+  one priority it would keep the core for ever once the callback has waited for a lock;
 * the thread of a loop that reads an output, at the place that the plan has for it, unless it has a
   real-time priority by itself;
 * an asynchronous publisher, below every other thread of its process on its core: it spins on the
@@ -111,27 +111,8 @@ def plan_scheduling(
         places=plan.receivers_at,
         take_turns=plan.takes_turns,
         clear={node.core for node in plan.shaping_nodes},
-        loops=planned_loops(plan),
-        raised_loops=_raised_loops(plan),
+        loops=[chain.loop for chain in plan.chains if chain.loop is not None],
     )
-
-
-def planned_loops(plan: Plan) -> list[tuple[PlannedLoop, ReceiverPlace]]:
-    """Return the loops that read outputs and have a place in the plan, with this place."""
-    return [
-        (chain.loop, chain.loop.runs_at)
-        for chain in plan.chains
-        if chain.loop is not None and chain.loop.runs_at is not None
-    ]
-
-
-def _raised_loops(plan: Plan) -> dict[str, int]:
-    """Return the real-time priorities that loops that read outputs gave themselves, by node."""
-    return {
-        chain.loop.node: chain.loop.realtime_priority
-        for chain in plan.chains
-        if chain.loop is not None and chain.loop.realtime_priority is not None
-    }
 
 
 def waiting_receivers(plan: Plan, wanted: Iterable[WantedScheduling]) -> list[str]:
@@ -164,8 +145,7 @@ def scheduling_around(
     places: Mapping[str, ReceiverPlace] = MappingProxyType({}),
     take_turns: bool = False,
     clear: Collection[int] = (),
-    loops: Sequence[tuple[PlannedLoop, ReceiverPlace]] = (),
-    raised_loops: Mapping[str, int] = MappingProxyType({}),
+    loops: Sequence[PlannedLoop] = (),
 ) -> tuple[WantedScheduling, ...]:
     """Return what the threads of servers, and the other threads of their processes, get.
 
@@ -179,9 +159,8 @@ def scheduling_around(
       other callbacks.
     * ``places``: for some receivers, another priority and, if it is available, another core.
     * ``take_turns``: whether servers of one priority share it by turns (SCHED_RR).
-    * ``loops``: loops that read an output, each with the place of its thread. A thread that has
-      raised itself stays as it is.
-    * ``raised_loops``: nodes whose loop has given itself a real-time priority, and this.
+    * ``loops``: loops that read an output. The thread of one that has a place gets it, unless it
+      has raised itself: then it stays as it is, and receivers without a place are below it.
     * ``clear``: the cores that DDS threads leave where all cores have servers; otherwise they leave
       all cores with servers.
 
@@ -192,7 +171,7 @@ def scheduling_around(
         name: sorted({place_of(listed, order) for listed in group})
         for name, group in members.items()
     }
-    of_loops = {loop.node: place for loop, place in loops}
+    of_loops = {loop.node: loop.runs_at for loop in loops if loop.runs_at is not None}
     priorities = server_priorities(_sizes(servers, places_taken, behind, {**of_loops, **places}))
     in_servers = [
         WantedScheduling(
@@ -219,7 +198,11 @@ def scheduling_around(
         priorities=priorities,
         available_cores=available_cores,
         busy=busy,
-        raised_loops=raised_loops,
+        raised={
+            loop.node: loop.realtime_priority
+            for loop in loops
+            if loop.realtime_priority is not None
+        },
     )
     receiving += _looping(allocation, planned, loops, priorities, available_cores)
     planned |= {item.node_thread.thread.identity for item in receiving}
@@ -286,11 +269,12 @@ def _receiving(
     priorities: Mapping[int, Sequence[int]],
     available_cores: Collection[int],
     busy: Collection[int],
-    raised_loops: Mapping[str, int],
+    raised: Mapping[str, int],
 ) -> tuple[list[WantedScheduling], set[int]]:
     """Return what executors of nodes that receive an output get, and their processes' ids.
 
-    See :func:`scheduling_around`; ``busy`` are the cores of servers.
+    See :func:`scheduling_around`; ``busy`` are the cores of servers, and ``raised`` has the
+    priorities that loops gave themselves, by their nodes.
     """
     below = max(1, min(map(min, priorities.values()), default=DDS_PRIORITY) - 1 - _BELOW)
     receiving, pids = list[WantedScheduling](), set[int]()
@@ -300,8 +284,8 @@ def _receiving(
             continue
         pids.add(listed.thread.pid)
         place = next((places[node] for node in listed.nodes if node in places), None)
-        loops = [raised_loops[node] - 1 for node in listed.nodes if node in raised_loops]
-        priority, reason = max(1, min([below, *loops])), _RECEIVES
+        below_loops = [raised[node] - 1 for node in listed.nodes if node in raised]
+        priority, reason = max(1, min([below, *below_loops])), _RECEIVES
         if place is not None and place.priority in priorities:
             priority, reason = priorities[place.priority][-1], _RECEIVES_IN_PLACE
             core = place.core if place.core in available_cores else core
@@ -326,7 +310,7 @@ def _taking_turns(receiving: Sequence[WantedScheduling]) -> list[WantedSchedulin
 def _looping(
     allocation: Allocation,
     planned: Collection[tuple[int, int]],
-    loops: Sequence[tuple[PlannedLoop, ReceiverPlace]],
+    loops: Sequence[PlannedLoop],
     priorities: Mapping[int, Sequence[int]],
     available_cores: Collection[int],
 ) -> list[WantedScheduling]:
@@ -336,8 +320,9 @@ def _looping(
     place already.
     """
     looping = list[WantedScheduling]()
-    for loop, place in loops:
-        if place.priority not in priorities or loop.thread is None:
+    for loop in loops:
+        place = loop.runs_at
+        if place is None or place.priority not in priorities or loop.thread is None:
             continue
         priority = priorities[place.priority][-1]
         for listed in allocation.threads:

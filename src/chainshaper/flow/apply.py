@@ -207,11 +207,10 @@ def _in_front_of_loops(plan: Plan) -> dict[str, str]:
     nodes = [loop.node for _, _, loop in loops_in_step(plan)]
     if not nodes:
         return {}
-    from chainshaper.sources.preload import in_front, installed_library, named_loops
+    from chainshaper.sources.preload import named_loops
 
     before = os.environ.get(named_loops.VARIABLE, "").split(",")
-    names = list(dict.fromkeys(filter(None, [*before, *nodes])))
-    return {**in_front(installed_library()), **named_loops.variables(names)}
+    return named_loops.in_front_of(list(dict.fromkeys(filter(None, [*before, *nodes]))))
 
 
 @dataclass

@@ -18,7 +18,7 @@ from chainshaper.planning import ChainPlan
 from chainshaper.planning.chain_plan import Server, Thread
 from chainshaper.planning.plan import Plan, open_until_done
 from chainshaper.planning.plan_file import plan_values
-from chainshaper.sources.preload import in_front, installed_library, named_loops
+from chainshaper.sources.preload import named_loops
 from chainshaper.splicing.application import splice_application
 from chainshaper.splicing.shaped_outputs import remove_abandoned_pages
 from chainshaper.values.errors import InputError, OperationError
@@ -65,8 +65,7 @@ def shape_application(
     loops_in_front = dict[str, str]()
     if loops_in_step(plan, adapt):
         enforcement = partial(loops_kept_in_step, plan, enforcement)
-        library = in_front(installed_library())
-        loops_in_front = {**library, named_loops.VARIABLE: named_loops.names_text([LOOP_NAME])}
+        loops_in_front = named_loops.in_front_of([LOOP_NAME])
     if adapt:
         plan, reaches_ns, _ = followed_chains(plan, "fifo", max_latency_ns)
         enforcement = partial(slots_followed, plan, reaches_ns, enforcement)

@@ -76,10 +76,9 @@ class ShapedLaunch:
     @property
     def setup(self) -> Path | None:
         """The file to source before the shaped launch file is launched again; None: none is."""
-        is_built = self.splicing is not None and any(
-            process.package is not None for process in self.splicing.processes
-        )
-        return self.splicing.folder / NODES / SETUP if self.splicing and is_built else None
+        if self.splicing is None or not _has_packages(self.splicing):
+            return None
+        return self.splicing.folder / NODES / SETUP
 
 
 Choose: TypeAlias = Callable[[ApplicationGraph, ChainEnumeration], str]
@@ -434,9 +433,14 @@ def _with_types(recordings: Sequence[Recording], plan: Plan) -> Recording:
     return next(filter(knows_types, recordings), recordings[0])
 
 
+def _has_packages(splicing: Splicing) -> bool:
+    """Return whether some of our nodes are to be built."""
+    return any(process.package is not None for process in splicing.processes)
+
+
 def _sourced(splicing: Splicing) -> list[str]:
     """Build our nodes; return the words before a command that source the environment they need."""
-    if all(process.package is None for process in splicing.processes):
+    if not _has_packages(splicing):
         return []
     setup = build_package(splicing.folder / NODES)
     return ["bash", "-c", 'source "$0" && exec "$@"', str(setup)]
@@ -493,13 +497,12 @@ def plan_in_force(
 ) -> Iterator[Callable[[Sequence[RunningProcess]], bool]]:
     """Have a thread apply the plan to what runs, until the context ends.
 
-    Yields a function that says whether all servers have opened, and outputs are in step with their
-    loops, for which it has a while. At the end the notes of the run
-    are added to ``notes``.
+    Yields a function that says whether all servers have opened and, for ``IN_STEP_NS`` at most,
+    whether outputs and loops are in step. At the end the notes of the run are added to ``notes``.
     """
     stop, states = threading.Event(), list[RunState]()
     loops = {loop.node for _, _, loop in loops_in_step(plan)}
-    opened_ns: list[int] = []  # when all servers were seen to have opened
+    opened_ns: int | None = None  # when all servers were first seen to have opened
     with ThreadPoolExecutor(1, "apply") as beside:
         applied = beside.submit(
             apply_plan,
@@ -515,6 +518,7 @@ def plan_in_force(
         )
 
         def opened(_: Sequence[RunningProcess]) -> bool:
+            nonlocal opened_ns
             if applied.done():
                 applied.result()  # raises what it failed with
                 raise OperationError("the plan was released meanwhile")
@@ -524,9 +528,9 @@ def plan_in_force(
             ours = [server for server in state.servers if server.kept_by == state.back_end]
             if not all(server.counters.slots for server in ours):
                 return False
-            opened_ns.append(time.monotonic_ns())
+            opened_ns = opened_ns or time.monotonic_ns()
             in_step = {step.loop for step in state.steps if step.moved_ns is not None}
-            return loops <= in_step or opened_ns[-1] - opened_ns[0] > IN_STEP_NS
+            return loops <= in_step or time.monotonic_ns() - opened_ns > IN_STEP_NS
 
         try:
             yield opened

@@ -208,8 +208,8 @@ def _usual_drift(behind: _Times, elapsed: _Times, common_ns: int) -> tuple[float
     Places repeat every ``common_ns``, so each is a direction. At the right drift directions agree,
     however late a few of them are; a line through the places would follow these. The frequency of
     the greatest sum of directions is sought, in bins of time that are short beside a turn of the
-    largest drift, and with zeros behind them, so that frequencies lie closely: the
-    drift is right to a sixteenth of ``common_ns`` over all.
+    largest drift, and with zeros behind them, so that frequencies lie closely: over the whole
+    recording the drift is right to a sixteenth of ``common_ns``.
     """
     lasted = int(-elapsed[0]) + 1
     turns = math.ceil(_LARGEST_DRIFT * lasted / common_ns) + 1  # at the largest drift

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 
 import polars as pl
 
+from chainshaper.sources.preload.in_front import in_front, installed_library
 from chainshaper.values import events
 from chainshaper.values.errors import InputError
 
@@ -46,6 +47,14 @@ def variables(names: Sequence[str]) -> dict[str, str]:
     Raises InputError: as :func:`names_text`.
     """
     return {VARIABLE: names_text(names)} if names else {}
+
+
+def in_front_of(names: Sequence[str]) -> dict[str, str]:
+    """Return the variables that start a command behind the library, and name loops to it.
+
+    Raises InputError: as :func:`names_text`. PlatformError: as :func:`.in_front`.
+    """
+    return {**in_front(installed_library()), **variables(names)}
 
 
 def not_named(names: Sequence[str], tables: events.EventTables) -> list[str]:
