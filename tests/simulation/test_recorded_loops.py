@@ -16,7 +16,7 @@ from chainshaper.analysis.chains import find_chain
 from chainshaper.analysis.graph import graph_of
 from chainshaper.flow.plan import plan_recording, profile_chains
 from chainshaper.flow.recorded_processes import recorded_processes
-from chainshaper.flow.recorded_profile.loops import before_loop, on_time, phase_of
+from chainshaper.flow.recorded_profile.loops import before_loop, phase_of
 from chainshaper.simulation import simulate
 from chainshaper.sources import open_source
 from chainshaper.values.application import Chain
@@ -68,15 +68,6 @@ def test_late_starts_are_no_drift(drift: float) -> None:
     assert phase.drift_ppm == pytest.approx(drift * 1e6, abs=0.5)
     assert phase.phase_ns == pytest.approx(int(due[-1]) % (10 * MS), abs=10 * US)
     assert phase.jitter_ns <= 50 * US, "8 of 1986 starts are late, or early as the next one: 0.4 %"
-
-
-def test_late_beginnings_of_cycles_are_put_where_they_are_due() -> None:
-    due = 5 * MS + (np.arange(0, 20_000 * MS, 20 * MS) * 1.00005).astype(np.int64)
-    late = np.zeros(len(due), np.int64)
-    late[::50] = 4 * MS
-    assert np.abs(on_time(due + late, 20 * MS) - due).max() <= 1 * US
-    irregular = np.sort(np.random.default_rng(3).integers(0, 20_000 * MS, 900))
-    assert (on_time(irregular, 20 * MS) == irregular).all()
 
 
 def test_starts_without_a_usual_phase_have_their_period_as_jitter() -> None:

@@ -91,7 +91,8 @@ def recorded_loop(
         measured["intervals_ns"] = tuple(round(float(value)) for value in apart)
     else:
         measured["period_ns"] = loop.period_ns
-        measured |= _phase_in_calm_cycles(whole, starts, loop.period_ns, period_ns)._asdict()
+        common_ns = math.gcd(loop.period_ns, period_ns)
+        measured |= _phase_in_calm_cycles(whole, starts, common_ns)._asdict()
     took = pl.coalesce("execution_ns", pl.col("end") - pl.col("start")).fill_null(0)
     in_cycles = instances.group_by(pl.col("start") // period_ns).agg(
         together=took.sum(), longest=took.max()
@@ -114,9 +115,7 @@ def recorded_loop(
     )
 
 
-def _phase_in_calm_cycles(
-    whole: LatencyAnalysis, starts: _Times, loop_ns: int, cycle_ns: int
-) -> "Phase":
+def _phase_in_calm_cycles(whole: LatencyAnalysis, starts: _Times, common_ns: int) -> "Phase":
     """Return the phase of the loop's starts in cycles that the machine did not disturb.
 
     Where it disturbed nearly all, it is that of all starts.
@@ -127,7 +126,7 @@ def _phase_in_calm_cycles(
     in_calm = (places >= 0) & np.isin(begun[np.maximum(places, 0)], calm)
     if in_calm.sum() >= _FEWEST:
         starts = starts[in_calm]
-    return phase_of(starts, on_time(begun, cycle_ns), math.gcd(loop_ns, cycle_ns))
+    return phase_of(starts, begun, common_ns)
 
 
 class Phase(NamedTuple):
@@ -141,8 +140,9 @@ class Phase(NamedTuple):
 def phase_of(starts: _Times, cycles: _Times, common_ns: int) -> Phase:
     """Return the phase of starts behind cycles, modulo ``common_ns``; all times in ns, ascending.
 
-    Where the two clocks drift apart, it is the phase at the end, and the jitter around the drift.
-    Starts that are late, by more than half of ``common_ns`` or several in turn, are no drift.
+    Cycles begin when they really did, late or not: ages count from there, so that the jitter has
+    that of both. Where the two clocks drift apart, it is the phase at the end, and the jitter
+    around the drift. Starts that are late, by more than half of ``common_ns`` or several in turn, are no drift.
     """
     places = np.searchsorted(cycles, starts, side="right") - 1
     behind = (starts - cycles[np.maximum(places, 0)])[places >= 0]
@@ -161,15 +161,6 @@ def phase_of(starts: _Times, cycles: _Times, common_ns: int) -> Phase:
         jitter_ns=jitter,
         drift_ppm=round(-drift * 1e6, 3) + 0.0,  # never -0.0
     )
-
-
-def on_time(cycles: _Times, cycle_ns: int) -> _Times:
-    """Return when cycles (ns, ascending) would have begun if none of them had been late.
-
-    A gate counts its slots from there. Cycles without a usual phase are returned as they are.
-    """
-    line = _line_through(cycles - cycles[0], cycles - cycles[-1], cycle_ns)
-    return cycles if line is None else cycles - np.rint(line.rest).astype(np.int64)
 
 
 class _Line(NamedTuple):
