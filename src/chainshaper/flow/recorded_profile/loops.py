@@ -142,7 +142,8 @@ def phase_of(starts: _Times, cycles: _Times, common_ns: int) -> Phase:
 
     Cycles begin when they really did, late or not: ages count from there, so that the jitter has
     that of both. Where the two clocks drift apart, it is the phase at the end, and the jitter
-    around the drift. Starts that are late, by more than half of ``common_ns`` or several in turn, are no drift.
+    around the drift. Starts that are late, by more than half of ``common_ns`` or several in turn,
+    are no drift.
     """
     places = np.searchsorted(cycles, starts, side="right") - 1
     behind = (starts - cycles[np.maximum(places, 0)])[places >= 0]
