@@ -28,12 +28,13 @@ from chainshaper.analysis import (
     recorded_flow,
 )
 from chainshaper.analysis.flow import DataFlow, left_when_taken
+from chainshaper.analysis.graph import with_possible_hand_overs
 from chainshaper.analysis.latency import summary
 from chainshaper.planning import ChainPlan, Plan
 from chainshaper.planning.chain_plan import publisher_servers
-from chainshaper.planning.plan import plan_of_chain
+from chainshaper.planning.plan import declared_in, plan_of_chain
 from chainshaper.planning.plan_file import plan_in
-from chainshaper.sources import open_source
+from chainshaper.sources import open_source, with_declared
 from chainshaper.values import events
 from chainshaper.values.durations import duration_text, milliseconds
 from chainshaper.values.errors import InputError, shown
@@ -171,6 +172,14 @@ def measure_latency(
     return _measured(opened(recording), (chain,), plan, flow)[0]
 
 
+def _declaring(flow: DataFlow, plan: Plan | None) -> DataFlow:
+    """Add what is declared in a plan, as far as it can be in the recording."""
+    declared = () if plan is None else declared_in(plan)
+    missing = tuple(pair for pair in declared if pair not in flow.through)
+    possible, _ = with_possible_hand_overs(replace(flow, through=missing))
+    return replace(flow, through=(*flow.through, *possible.through))
+
+
 def opened(recording: Recording | str | Path) -> Recording:
     """The recording itself, or the one at a path."""
     return recording if isinstance(recording, Recording) else open_source(recording)
@@ -189,12 +198,15 @@ def _measured(
     chains: Sequence[str | None],
     plan: Plan | None,
     flow: DataFlow | None = None,
+    *,
+    declaring: Plan | None = None,
 ) -> list[Measurement]:
     """Measure several chains in a recording; its events are resolved once."""
     joint, info = _plan_of(recording, plan), recording.info
     due = [] if joint is None else [due for planned in joint.chains for due in due_of(planned)]
     spell, left_out = _in_force(recording)
-    flow = flow or recorded_flow(recording)
+    flow = _declaring(flow or recorded_flow(recording), joint or declaring)
+    recording = with_declared(recording, flow.through)
     if (
         gated := [planned for planned in joint.chains if any(publisher_servers(planned))]
         if joint
@@ -322,9 +334,8 @@ def compare_chains(
     columns = []
     for number, recording in enumerate(opened_recordings, start=1):
         progress((number - 1) / len(opened_recordings), f"analysing {recording.path}")
-        columns.append(
-            _measured(recording, chains, plan if number == len(opened_recordings) else None)
-        )
+        in_force = plan if number == len(opened_recordings) else None
+        columns.append(_measured(recording, chains, in_force, declaring=joint))
     return tuple(
         Comparison(measurements[0].analysis.chain.spec, measurements)
         for measurements in zip(*columns, strict=True)
