@@ -246,8 +246,8 @@ def test_a_watch_takes_it(
 ) -> None:
     """Three cycles of four, by hand; the message of the second one was not used."""
     now = time.monotonic_ns() - 10_000
-    times = (tuple(now + at for at in of_callback) for of_callback in (SENT, ACTED))
-    tables = hidden(*times).tables()
+    sent, acted = (tuple(now + at for at in of_callback) for of_callback in (SENT, ACTED))
+    tables = hidden(sent, acted).tables()
     watch = Watch(["/a../cmd"], users=(), longest_ns=1, through=parse_through(through))
     monkeypatch.setattr(watch, "read", lambda: None)
     monkeypatch.setattr(watch, "_tables", lambda _: tables)

@@ -190,6 +190,8 @@ def latency(
         tables.append(of_chain.data_age_table(analysis.data_age))
     if out.present(json, values, *tables):
         out.show_line(f"{of_chain.doubts_text(measurement)}; {out.lost_events(recording)}")
+        if values["promise"] is not None:
+            out.show_line(values["promise"]["text"])
         for path in drawn:
             out.show_line(path)
         out.notes(analysis.notes)
