@@ -15,8 +15,6 @@ Both repeat in time; what they have in common is the greatest common divisor of 
 loop. Moves are of less than a step, and later ones small, as the drift has it.
 """
 
-import os
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
@@ -24,6 +22,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 from chainshaper.enforcement.undoing import LoopState, LoopStep
+from chainshaper.flow.background import Background
 from chainshaper.flow.loop_phase import LoopPhase, PhaseTrack, phase_of
 from chainshaper.linux.threads import list_threads
 from chainshaper.planning.chain_plan import (
@@ -152,7 +151,6 @@ class InStep:
         assert loop is not None and loop.period_ns is not None  # noqa: S101 - as planned
         assert shaping is not None  # noqa: S101 - else there is no slot to move
         self.steps: tuple[LoopStep, ...] = ()
-        self.failure: ChainshaperError | None = None
         self.loop_moves: list[LoopMoved] = []
         self.chain, self.loop, self.period_ns = chain, loop, loop.period_ns
         self.step_ns, self._tolerance_ns = loop_common_ns(chain), tolerance_ns
@@ -173,9 +171,13 @@ class InStep:
         self._looks = 0
         self._off = deque[tuple[int, int]]()  # when a start was seen, and how far it was off
         self._settles = False  # something was moved at the latest look
-        self._cores, self._stop = cores, threading.Event()
-        self._thread = threading.Thread(target=self._follow, name="in-step", daemon=True)
+        self._thread = Background("in-step", self._follow, "following", cores)
         self._thread.start()
+
+    @property
+    def failure(self) -> ChainshaperError | None:
+        """Why both are not kept in step any more; None: they are."""
+        return self._thread.failure
 
     @property
     def has_loop(self) -> bool:
@@ -263,23 +265,14 @@ class InStep:
 
     def end(self) -> None:
         """Have all be where the plan and the loop have it, and follow no more."""
-        self._stop.set()
-        self._thread.join()
+        self._thread.end()
         self._output.close()
         if self._mover is not None:
             self._mover.close()
 
     def _follow(self) -> None:
-        if self._cores:
-            os.sched_setaffinity(0, self._cores)  # the calling thread's alone
-        try:
-            while not self._stop.wait(LOOK_S):
-                self.look()
-        except ChainshaperError as error:
-            if not self._stop.is_set():
-                self.failure = error
-        except Exception as error:  # a thread that ends in silence follows no more
-            self.failure = OperationError(f"following has failed ({type(error).__name__}: {error})")
+        while not self._thread.stop.wait(LOOK_S):
+            self.look()
 
     def look(self) -> None:
         """Look where both are, and move what is to be moved."""
