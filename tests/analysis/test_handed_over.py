@@ -1,7 +1,10 @@
 """What the user declares that no event shows: `--through /f=/cmd`."""
 
+import json
+import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from command_line import called, json_of, refused
@@ -9,9 +12,14 @@ from loop_story import LOOP, PID, first_sleep, loop_behind, turn
 from story import OFFSET, Story
 
 from chainshaper.analysis import DataFlow, analyse_latency, data_flow, graph_of
+from chainshaper.monitor.budgets import Budget, ChainBudget, check_budget, load_budget
+from chainshaper.monitor.watch import Watch
+from chainshaper.planning.plan_file import load_plan
+from chainshaper.sources import open_source
 from chainshaper.values.errors import InputError
 from chainshaper.values.handed_over import parse_through
 from chainshaper.values.recording import Recording, RecordingInfo, write_recording
+from chainshaper.verify.slowdowns import slowdowns_in
 
 
 def flow_of(story: Story, *through: str) -> DataFlow:
@@ -162,3 +170,136 @@ def test_wrong_use_on_the_command_line(recording: Recording) -> None:
     for through, said in (("/b=/cmd", "no node of the recording reads /b"), ("/a", "with = ")):
         words = (recording.path, "--chain", "/a../cmd", "--through", through)
         assert said in " ".join(refused(2, "latency", *words).split())
+
+
+def regular(path: Path, late: int = 0, count: int = 60) -> Path:
+    """A recording of cycles of 100 ms, whose /cmd comes 35 ms behind the beginning, or later."""
+    cycles = range(1000, 1000 + 100 * count, 100)
+    story = hidden(tuple(cycles), tuple(at + 30 + late for at in cycles), 1_000_000)
+    return write_recording(
+        path, story.tables(), RecordingInfo(source="lttng", clock_offset_ns=OFFSET)
+    ).path
+
+
+def test_a_budget_keeps_what_was_declared(tmp_path: Path) -> None:
+    path, slower = regular(tmp_path / "regular"), regular(tmp_path / "slower", late=20)
+    words, budget = ("--chain", "/a../cmd", "--through", "a=/cmd"), tmp_path / "limits.yaml"
+    assert called("budget", path, *words, "-o", budget).code == 0
+    limits = load_budget(budget)
+    assert limits.through == ("/a=/cmd",)
+    assert limits.chains[0].maximum_ns == 38_500_000, "35 ms, and a tenth more"
+    assert called("check", path, "--budget", budget).code == 0
+    broken = called("check", slower, "--budget", budget, "--json")
+    texts = [limit["text"] for limit in json.loads(broken.out)["limits"] if not limit["met"]]
+    assert broken.code == 1 and "/a../cmd: maximum 55 ms, budget 38.5 ms" in texts[0]
+    undeclared = tmp_path / "undeclared.yaml"
+    undeclared.write_text(budget.read_text().replace("through: [/a=/cmd]\n", ""))
+    missing = called("check", path, "--budget", undeclared)
+    assert missing.code == 1 and "no path leads" in " ".join(missing.out.split())
+    declared = ("check", path, "--budget", undeclared, "--through", "/a=/cmd")
+    assert called(*declared).code == 0
+
+
+def test_a_declaration_in_a_budget_that_is_none_names_its_line(tmp_path: Path) -> None:
+    budget = tmp_path / "limits.yaml"
+    budget.write_text("format: 1\nthrough: [/a]\nchains: [{chain: /a../cmd, maximum: 1ms}]\n")
+    said = refused(2, "check", regular(tmp_path / "regular"), "--budget", budget)
+    assert "limits.yaml:2" in said and "with = between them" in " ".join(said.split())
+
+
+def test_a_declaration_that_cannot_be_in_a_recording_breaks_its_own_chain_alone(
+    tmp_path: Path,
+) -> None:
+    recording = open_source(regular(tmp_path / "regular"))
+    limits = Budget(
+        through=("/other=/cmd",),
+        chains=(
+            ChainBudget(chain="/a../debug", maximum_ns=100_000_000),
+            ChainBudget(chain="/a../cmd", maximum_ns=100_000_000),
+        ),
+    )
+    found, missing = check_budget(recording, limits)
+    assert found.met and not missing.met
+    assert "no path leads" in missing.text and "reads /other" in missing.text
+
+
+def test_a_comparison_with_a_baseline_takes_it(tmp_path: Path) -> None:
+    paths = [regular(tmp_path / "before")], [regular(tmp_path / "after")]
+    for through, is_missing in ((("/a=/cmd",), False), ((), True), (("/x=/cmd",), True)):
+        _, notes = slowdowns_in(*paths, ["/a../cmd"], through=through)
+        assert any("/a../cmd is not in" in note for note in notes) == is_missing
+        assert any("no node of the recording reads /x" in note for note in notes) == (
+            through == ("/x=/cmd",)
+        )
+
+
+@pytest.mark.parametrize(
+    ("through", "problem"),
+    [
+        (("/a=/cmd",), None),
+        ((), "no path leads"),
+        (("/x=/cmd",), "no node of the recording reads /x"),
+    ],
+)
+def test_a_watch_takes_it(
+    monkeypatch: pytest.MonkeyPatch, through: tuple[str, ...], problem: str | None
+) -> None:
+    """Three cycles of four, by hand; the message of the second one was not used."""
+    now = time.monotonic_ns() - 10_000
+    sent, acted = (tuple(now + at for at in of_callback) for of_callback in (SENT, ACTED))
+    tables = hidden(sent, acted).tables()
+    watch = Watch(["/a../cmd"], users=(), longest_ns=1, through=parse_through(through))
+    monkeypatch.setattr(watch, "read", lambda: None)
+    monkeypatch.setattr(watch, "_tables", lambda _: tables)
+    monkeypatch.setattr(watch, "processes", {10: SimpleNamespace(pid=10, lost=0, dropped=0)})
+    monkeypatch.setattr(watch, "_ended", lambda: [])
+    watch._over_ns = 0
+    (chain,) = watch.look().chains
+    if problem is None:
+        assert chain.problem is None
+        assert (chain.counted["complete"], chain.counted["not_used"]) == (3, 1)
+        assert chain.spans["hour"].max_ns == 35
+    else:
+        assert problem in str(chain.problem)
+
+
+def test_a_plan_has_it_and_whoever_takes_the_plan(tmp_path: Path) -> None:
+    """Without it `compare` would not find the chain that the plan names."""
+    path, planned = regular(tmp_path / "regular"), tmp_path / "plan.yaml"
+    words = ("--chain", "/a../cmd", "--through", "/a=/cmd")
+    assert called("plan", path, *words, "-o", planned).code == 0
+    assert load_plan(planned).chains[0].chain.through == ("/a=/cmd",)
+    again = regular(tmp_path / "again")
+    assert called("compare", path, again, "--plan", planned).code in (0, 1)
+    measured = json_of("compare", path, again, "--plan", planned)
+    assert measured["chain"] == "/a../cmd"
+    watch = Watch(["/a../cmd"], users=(), plan=load_plan(planned))
+    assert watch.through == (("/a", "/cmd"),)
+
+
+def test_an_output_that_is_shaped_is_what_its_publisher_was_to_publish(tmp_path: Path) -> None:
+    """The actor publishes /cmd/unshaped now, and a gate /cmd: the declaration still names /cmd."""
+    story = Story()
+    node = story.node("/sensor", 10)
+    timer, sensor = story.timer(node, 100), story.publisher(node, "/a")
+    filtering, actor = story.node("/filter", PID), story.node("/actor", PID)
+    reader, debug = story.subscription(filtering, "/a"), story.publisher(filtering, "/debug")
+    acting, cmd = story.timer(actor, 100), story.publisher(actor, "/cmd/unshaped")
+    shaping = story.node("/shaping", 30)
+    gate, shaped = story.subscription(shaping, "/cmd/unshaped"), story.publisher(shaping, "/cmd")
+    for at in (1000, 1100, 1200):
+        story.runs(timer, at, at + 2, writes=((sensor, at + 1),))
+        story.runs(reader, at + 10, at + 12, reads=at + 1, writes=((debug, at + 11),), tid=21)
+        story.runs(acting, at + 30, at + 38, writes=((cmd, at + 35),), tid=LOOP)
+        story.runs(gate, at + 40, at + 62, reads=at + 35, writes=((shaped, at + 60),))
+        gated = {"callback": gate.handle, "source_timestamp": at + 35 + OFFSET, "arrival": at + 40}
+        gated |= {"origin": at, "release": at + 60, "slot": 0, "cycles_waited": 0}
+        story.event("gate_release", at + 60, 30, **gated, anchor="stamp")
+    assert latencies(flow_of(story, "/a=/cmd"), "/a../cmd") == [60, 60, 60]
+    path = tmp_path / "shaped"
+    write_recording(
+        path,
+        story.tables(),
+        RecordingInfo(source="lttng", clock_offset_ns=OFFSET, chain="/a../cmd"),
+    )
+    assert json_of("latency", path, "--through", "/a=/cmd")["max_ns"] == 60

@@ -21,6 +21,7 @@ from chainshaper.enforcement.node_threads import Allocation, NodeThread
 from chainshaper.enforcement.servers import ServerCounters
 from chainshaper.enforcement.undoing import RunState, SlotMove
 from chainshaper.flow import anchoring, apply
+from chainshaper.flow.background import Background
 from chainshaper.flow.drift import SlotFollower, TimerTrack
 from chainshaper.flow.phase import DriftWatch, Phase
 from chainshaper.flow.plan_in_force import origins, supervision
@@ -282,13 +283,13 @@ def test_a_place_that_another_chain_has_is_why_slots_do_not_follow() -> None:
         raise InputError("there is another chain's slot")
 
     follower = object.__new__(SlotFollower)
-    follower._cores, follower._stop, follower.failure = (), Event(), None
+    follower._thread = Background("", follower._follow, "following")
     follower._chain, follower._planned_ns = cast("ChainPlan", SimpleNamespace(cycle_ns=MS)), 0
     tail = SimpleNamespace(start_ns=0)
     tail.add = lambda seen_ns: setattr(tail, "start_ns", seen_ns)
     follower._tail, follower._put_in_force = cast("Tail", tail), refuse
     follower._output = cast("FollowedOutput", SimpleNamespace(latencies=lambda: [MS]))
-    follower._follow()
+    follower._thread.run()
     assert str(follower.failure) == "there is another chain's slot"
 
 
@@ -510,12 +511,13 @@ def test_a_thread_that_fails_while_it_looks_or_follows_says_why(
     monkeypatch.setattr(DriftWatch, "EVERY_S", 0.0)
     watch = DriftWatch(1, [1], 100 * MS, 48 * MS)
     wait_for(lambda: watch.failure is not None, "the watch to end")
-    assert watch.failure == "looking for it has failed (ZeroDivisionError: nothing to divide by)"
+    why = "looking for it has failed (ZeroDivisionError: nothing to divide by)"
+    assert str(watch.failure) == why
     follower = SlotFollower.__new__(SlotFollower)
-    follower._cores, follower._stop, follower.failure = (), Event(), None
+    follower._thread = Background("", follower._follow, "following")
     follower._chain, follower._tail = (
         cast("ChainPlan", SimpleNamespace(cycle_ns=1)),
         cast("Tail", None),
     )
-    follower._follow()
+    follower._thread.run()
     assert str(follower.failure).startswith("following has failed (AttributeError: ")

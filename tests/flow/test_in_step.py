@@ -2,15 +2,25 @@
 
 import random
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+from known import known
+from pydantic import TypeAdapter
 from small_chain import small_chain_plan
 
+from chainshaper.analysis.loop_rates import LoopRate
+from chainshaper.enforcement.journal import STATE_FILE
+from chainshaper.enforcement.undoing import LoopState, RunState, save_run_state
 from chainshaper.flow import in_step
 from chainshaper.flow.in_step import InStep, OwnStarts, loops_in_step, next_move
+from chainshaper.monitor import watch as watch_module
+from chainshaper.monitor.watch import Seen, Watch, _values
+from chainshaper.monitor.watched_loops import LoopNow
 from chainshaper.planning.chain_plan import (
     ChainPlan,
     LoopAge,
@@ -20,6 +30,7 @@ from chainshaper.planning.chain_plan import (
     revised,
 )
 from chainshaper.planning.plan import Plan
+from chainshaper.reporting.overviews import servers_table, watch_tables
 from chainshaper.sources.preload import LoopMoved
 from chainshaper.values.errors import InputError
 
@@ -278,3 +289,114 @@ def test_a_plan_that_is_in_step_does_not_follow_latencies() -> None:
     with pytest.raises(InputError, match="in step with a loop"):
         loops_in_step(plan, adapt=True)
     assert not loops_in_step(Plan.of(small_chain_plan(10 * MS, 20 * MS)), adapt=True)
+
+
+@pytest.mark.parametrize("moves", ["loop", "output"])
+def test_how_both_are_is_measured(follow: Callable[..., InStep], moves: str) -> None:
+    """Phase error and drift are those of the world, but for what its starts spread (20 us)."""
+    world = World(plan_in_step(moves), 50.0)
+    kept = follow(world)
+    run(world, kept, 1)
+    assert not kept.state.in_step and kept.state.waits_for == kept.waits_for
+    run(world, kept, 60)
+    state = kept.state
+    assert state.in_step and state.is_there and state.waits_for is None
+    assert known(state.error_ns) == pytest.approx(world.off_ns(), abs=20_000)
+    assert known(state.drift_ppm) == pytest.approx(50, abs=1)
+    assert state.moved_ns == (world.kept_ns if moves == "loop" else world.moved_ns)
+    assert state.starts > 1000 and state.misses == 0
+    # It is started again elsewhere: until that is noticed its starts are off by more than the lead.
+    before, world.first_ns = state.starts, world.first_ns + 4 * MS
+    run(world, kept, 0.5)
+    assert 0 < kept.state.misses <= kept.state.starts - before + 1
+    world.alive = False
+    run(world, kept, 1)
+    assert not kept.state.is_there
+    assert "no such loop is seen to sleep" in kept.state.text
+
+
+def loop_state(**values: Any) -> LoopState:
+    known_values: dict[str, Any] = {
+        "chain": "/scan../command",
+        "loop": "/controller",
+        "moves": "loop",
+        "lead_ns": MS,
+        "is_there": True,
+        "in_step": True,
+        "waits_for": None,
+        "moved_ns": 3 * MS,
+        "error_ns": -12_000,
+        "drift_ppm": 50.0,
+        "age_ns": 21 * MS,
+        "starts": 6000,
+        "misses": 0,
+    }
+    return LoopState(**{**known_values, **values})
+
+
+def test_a_run_keeps_it_for_status(tmp_path: Path) -> None:
+    state = RunState("1", 1, "plan.yaml", (), "fifo", "", 0, 20 * MS, loops=(loop_state(),))
+    state = replace(state, anchor_ns=0)
+    save_run_state(tmp_path, state)
+    again = TypeAdapter(RunState).validate_json((tmp_path / STATE_FILE).read_bytes())
+    assert again == state
+    said = (
+        "/scan../command and the loop of /controller are in step: lead 1 ms, off by -0.012 ms,"
+        " drift +50.0 ppm, loop moved by 3 ms, 0 of 6000 starts missed in the last minute"
+    )
+    assert said == state.loops[0].text
+    assert said in str(servers_table(state).caption)
+
+
+@pytest.mark.parametrize(
+    ("values", "level"),
+    [
+        ({}, 0),
+        ({"misses": 2}, 1),
+        ({"in_step": False, "waits_for": "the loop's phase is being measured"}, 1),
+        ({"in_step": False, "is_there": False, "waits_for": "no such loop is seen to sleep"}, 2),
+    ],
+)
+def test_its_status_is_published(values: dict[str, Any], level: int) -> None:
+    state = loop_state(**values)
+    rate = LoopRate("/controller", ("/command",), (7,), 6000, 10 * MS, None, None)
+    loops = (LoopNow("loop of /controller to /command", rate, 4, None),)
+    seen = Seen(0, {}, 0, (), loops=loops, in_step=(state,))
+    (status,) = seen.as_diagnostics()
+    assert status["name"] == "chainshaper: /scan../command and the loop of /controller in step"
+    assert (status["level"], status["message"]) == (level, state.text)
+    assert status["values"] == {
+        "lead [ms]": "1.000",
+        "phase error [ms]": "-0.012",
+        "moved by [ms]": "3.000",
+        "age of its data [ms]": "21.000",
+        "drift [ppm]": "50.0",
+        "moved": "loop",
+        "starts in the last minute": "6000",
+        "misses in the last minute": str(state.misses),
+        "misses of its rate in the last minute": "4",
+    }
+    both = {"chain": "/scan../command", "loop": "/controller", "moves": "loop"}
+    measured = {name: value for name, value, about in _values(seen) if about == both}
+    assert measured == {
+        "loop.in_step": float(state.in_step),
+        "loop.step_lead": pytest.approx(1e-3),
+        "loop.step_error": pytest.approx(-12e-6),
+        "loop.step_moved": pytest.approx(3e-3),
+        "loop.step_drift": pytest.approx(50e-6),
+        "loop.step_starts": 6000.0,
+        "loop.step_misses": float(state.misses),
+    }
+    assert seen.as_json()["in_step"][0]["error_ns"] == -12_000
+    assert "in step" in str(watch_tables(seen)[-1].columns[0].title)
+
+
+def test_a_watch_sees_what_runs_keep_in_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    state = RunState("1", 1, "plan.yaml", (), "fifo", "", 0, 20 * MS, loops=(loop_state(),))
+    runs = [
+        (SimpleNamespace(owner=1), state),
+        (SimpleNamespace(owner=None), state),  # it has crashed
+        (SimpleNamespace(owner=1), None),
+    ]
+    monkeypatch.setattr(watch_module, "find_runs", lambda: runs)
+    assert Watch([], users=()).look().in_step == (loop_state(),)

@@ -37,6 +37,7 @@ from chainshaper.analysis.loops import NO_TURNS, regular_period, seems_regular, 
 from chainshaper.analysis.lost_ends import LOOKS, without_disproved_ends
 from chainshaper.analysis.matching import by_number, ends_of_starts, first_after, latest_before
 from chainshaper.analysis.messages import (
+    gate_decisions,
     link_takes,
     publications,
     service_calls,
@@ -154,6 +155,8 @@ def data_flow(
     instances = ends.instances
     instances, taken = _with_assumed_readers(instances, taken, objects, tables)
     taken = _consumed(taken, instances)
+    if "gate_release" in tables:
+        taken = _released(taken, instances, gate_decisions(tables, objects))
     taken, unseen = with_unseen_takes(taken, instances, published, objects)
     published = _published_in(published, instances, objects)
     if "rcl_timer_call" not in tables and instances["assumed"].any():
@@ -431,6 +434,37 @@ def _consumed(taken: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
                 assumed_instance=pl.coalesce("assumed_instance", instance_of_take)
             )
     return taken.rename({"assumed_instance": "instance"})
+
+
+def _released(
+    taken: pl.DataFrame, instances: pl.DataFrame, decisions: pl.DataFrame
+) -> pl.DataFrame:
+    """Give messages that waited in a gate the ``instance`` in which they left, as its log has it.
+
+    A gate takes further messages while it holds one, and lets each go in an instance of its own:
+    the message taken last before that instance need not be the one in it. And a message that the
+    executor took while others waited has an instance as well that only queued it. ``decisions`` is
+    the frame of :func:`~chainshaper.analysis.messages.gate_decisions`. Where stamps of several
+    messages are equal nothing is changed.
+    """
+    key = ["callback_id", "source_timestamp"]
+    left = decisions.filter(pl.col("dropped").is_null()).drop_nulls([*key, "time"])
+    left = left.filter(pl.struct(key).is_unique())
+    if left.is_empty():
+        return taken
+    began = instances.filter(~pl.col("assumed"))
+    began = began.select("callback_id", "instance", "end", began="start")
+    left = latest_before(left.select(*key, "time"), began, ["callback_id"], "time", "began")
+    left = left.filter(pl.col("time") <= pl.coalesce("end", "time")).drop_nulls("instance")
+    left = left.filter(pl.col("instance").is_unique())  # else the log does not fit the events
+    takes = taken.select(*key, "take", took="time").join(left, on=key)
+    takes = takes.filter(pl.col("took") <= pl.col("began")).sort("take")
+    known = takes.group_by(key).agg(pl.col("instance", "take").last())
+    others = takes.join(known, on="take", how="anti")["take"]
+    claimed = pl.col("instance").is_in(known["instance"].implode())
+    claimed |= pl.col("take").is_in(others.implode())
+    instance = by_number(known, "take", "instance", taken.height)
+    return taken.with_columns(instance=pl.coalesce(instance, pl.when(~claimed).then("instance")))
 
 
 def _answered(published: pl.DataFrame, taken: pl.DataFrame) -> pl.DataFrame:

@@ -29,6 +29,7 @@ import numpy as np
 import polars as pl
 
 from chainshaper.analysis.flow import DataFlow, data_flow
+from chainshaper.analysis.messages import gate_decisions
 from chainshaper.analysis.objects import endpoints
 from chainshaper.values import events
 from chainshaper.values.application import (
@@ -50,8 +51,12 @@ def application_graph(tables: events.EventTables) -> ApplicationGraph:
     return graph_of(data_flow(tables))
 
 
-def graph_of(flow: DataFlow) -> ApplicationGraph:
-    """Make the application graph of a data flow."""
+def graph_of(flow: DataFlow, doubts: list[str] | None = None) -> ApplicationGraph:
+    """Make the application graph of a data flow.
+
+    With ``doubts``, what the user declared and cannot be here is left out, and why is added to
+    them. Else raises InputError: a declaration cannot be.
+    """
     pairs = flow.publications.lazy().select("callback_id", "topic").drop_nulls().unique()
     writes = defaultdict[int, set[str]](set)
     for callback_id, topic in pairs.collect().iter_rows():
@@ -78,7 +83,18 @@ def graph_of(flow: DataFlow) -> ApplicationGraph:
     for callback in callbacks:
         if is_named_loop(callback):
             named_loops[callback.pid].append(callback)
-    handed = _handed_over(callbacks, flow)
+    through, handed = list[tuple[str, str]](), defaultdict[int, set[str]](set)
+    for declared in flow.through:
+        try:
+            pair, readers = _handed_over(callbacks, flow, *declared)
+        except InputError as error:
+            if doubts is None:
+                raise
+            doubts.append(str(error))
+            continue
+        through.append(pair)
+        for number in readers:
+            handed[number].add(pair[1])
     created = flow.objects.nodes.select("node", "pid").unique(maintain_order=True).iter_rows()
     nodes = dict.fromkeys((node, last.get((node, pid), pid)) for node, pid in created)
     complete = []
@@ -95,43 +111,62 @@ def graph_of(flow: DataFlow) -> ApplicationGraph:
         callbacks=tuple(complete),
         publishers=_by_topic(flow.objects.publishers),
         subscribers=_by_topic(flow.objects.subscriptions),
-        through=flow.through,
+        through=tuple(through),
     )
 
 
-def _handed_over(callbacks: Sequence[Callback], flow: DataFlow) -> dict[int, set[str]]:
-    """Map callbacks to the topics into which their messages go as the user declared.
+def with_possible_hand_overs(flow: DataFlow) -> tuple[DataFlow, tuple[str, ...]]:
+    """Leave out what was declared and cannot be in a recording; say why of each declaration."""
+    if not flow.through:
+        return flow, ()
+    doubts = list[str]()
+    return replace(flow, through=graph_of(flow, doubts).through), tuple(doubts)
 
-    ``callbacks`` publish what their own instances did. Raises InputError: what was declared cannot
-    be, since a topic is not there, or nobody in a process has both.
+
+def _handed_over(
+    callbacks: Sequence[Callback], flow: DataFlow, read: str, written: str
+) -> tuple[tuple[str, str], list[int]]:
+    """Return what a declaration says of a recording, and the ids of callbacks that hand over.
+
+    That is the declaration itself; where ``written`` is an output that is shaped here, its
+    messages go into what its shaping node reads. ``callbacks`` publish what their own instances
+    did. Raises InputError: it cannot be, since a topic is not there, or nobody in a process has
+    both.
     """
-    handed = defaultdict[int, set[str]](set)
-    for read, written in flow.through:
-        declared = f"--through {read}={written}"
-        for topic, ends in ((read, flow.objects.subscriptions), (written, flow.objects.publishers)):
-            known = {*ends["topic"].cast(pl.String).drop_nulls()} - INTERNAL_TOPICS
-            if topic not in known:
-                doing = "reads" if topic == read else "publishes"
-                close = close_names(topic, known)
-                remedy = f"did you mean {' or '.join(close)}?" if close else "see `graph`"
-                raise InputError(f"{declared}: no node of the recording {doing} {topic}; {remedy}")
-        readers_of = [c for c in callbacks if c.kind == "subscription" and c.topic == read]
+    declared = f"--through {read}={written}"
+    for topic, ends in ((read, flow.objects.subscriptions), (written, flow.objects.publishers)):
+        known = {*ends["topic"].cast(pl.String).drop_nulls()} - INTERNAL_TOPICS
+        if topic not in known:
+            doing = "reads" if topic == read else "publishes"
+            close = close_names(topic, known)
+            remedy = f"did you mean {' or '.join(close)}?" if close else "see `graph`"
+            raise InputError(f"{declared}: no node of the recording {doing} {topic}; {remedy}")
+    writers = [c for c in callbacks if written in c.publishes]
+    gates = _gates(flow)
+    if inputs := [c.topic for c in writers if c.id in gates and c.topic]:
+        written = inputs[0]
         writers = [c for c in callbacks if written in c.publishes]
-        for callback in readers_of:
-            if any(w.pid == callback.pid and w.id != callback.id for w in writers):
-                handed[callback.id].add(written)
-        if readers_of and writers and not any(written in handed[c.id] for c in readers_of):
-            ways = [
-                ", ".join(sorted({f"{c.node} (process {c.pid})" for c in ends}))
-                for ends in (readers_of, writers)
-            ]
-            raise InputError(
-                f"{declared}: {ways[0]} reads {read}, {ways[1]} publishes {written}, and these are"
-                " not in one process, or one callback does both: what a callback publishes itself"
-                " needs no declaration, and what goes from process to process is a message; name"
-                " the topic in between, or the nodes of one process"
-            )
-    return handed
+    readers_of = [c for c in callbacks if c.kind == "subscription" and c.topic == read]
+    handing = [c.id for c in readers_of if any(w.pid == c.pid and w.id != c.id for w in writers)]
+    if readers_of and writers and not handing:
+        ways = [
+            ", ".join(sorted({f"{c.node} (process {c.pid})" for c in ends}))
+            for ends in (readers_of, writers)
+        ]
+        raise InputError(
+            f"{declared}: {ways[0]} reads {read}, {ways[1]} publishes {written}, and these are"
+            " not in one process, or one callback does both: what a callback publishes itself"
+            " needs no declaration, and what goes from process to process is a message; name"
+            " the topic in between, or the nodes of one process"
+        )
+    return (read, written), handing
+
+
+def _gates(flow: DataFlow) -> set[int]:
+    """Return the ids of callbacks that a gate's log is about: those of shaping nodes."""
+    if "gate_release" not in flow.events:
+        return set()
+    return {*gate_decisions(flow.events, flow.objects)["callback_id"].drop_nulls()}
 
 
 def is_named_loop(callback: Callback) -> bool:

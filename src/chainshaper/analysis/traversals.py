@@ -151,7 +151,10 @@ def traverse(flow: DataFlow, chain: Chain, graph: ApplicationGraph | None = None
         notes += repeats
         if topic in callback.passes_on or (hop and goes_on_elsewhere(graph, callback, topic)):
             reading = readers(graph, callback, topic)
-            state, note = _publish_by_sibling(flow, state, hop, callback, topic, reading=reading)
+            declared = (callback.topic, topic) in graph.through
+            state, note = _publish_by_sibling(
+                flow, state, hop, callback, topic, reading=reading, declared=declared
+            )
             if _keeps_newest(graph, callback, topic):
                 state = _newest_alone(state, hop)
             notes += note
@@ -250,14 +253,15 @@ def _publish_by_sibling(
     topic: str,
     *,
     reading: Sequence[Callback],
+    declared: bool,
 ) -> tuple[pl.DataFrame, list[str]]:
     """Fill in what another callback of the node published for the message.
 
     It is the publication of the node's first instance that starts after the message's own; or of
     the instance of a loop in which it was taken. Messages from before the node was started again
     have none: the new process never got them. ``reading`` are timers and loops that publish what
-    the callback stored, also those of other nodes. The notes say where it is not clear which input
-    an output of message_filters got.
+    the callback stored, also those of other nodes; ``declared``: the user says that they do. The
+    notes say where it is not clear which input an output of message_filters got.
     """
     publication, sibling = f"publication_{hop}", f"sibling_{hop}"
     publishers = flow.objects.publishers.select("publisher", created="valid_from")
@@ -291,7 +295,7 @@ def _publish_by_sibling(
         pl.coalesce(publication, later), (pl.col(sibling) | later.is_not_null()).alias(sibling)
     )
     stores = MESSAGE_FILTER not in (callback.symbol or MESSAGE_FILTER) or bool(loops)
-    stores = stores or (callback.topic, topic) in flow.through
+    stores = stores or declared
     if callback.kind == "service" or stores:
         return state, []  # a callback that stores its latest message: old values are its purpose
     reached = state[publication].drop_nulls()

@@ -1,6 +1,6 @@
 """Options that several verbs share, and those that are wishes for a plan."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from functools import wraps
 from inspect import Parameter, Signature, signature
@@ -330,8 +330,12 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
         return Modes(topic=topic, default=pairs[0][0], bands=bands, late=late or "publish")
 
 
-def recording_of(named: Path | None, plan: "cs.Plan | None" = None) -> "cs.Recording | None":
+def recording_of(
+    named: Path | None, plan: "cs.Plan | None" = None, through: Sequence[str] = ()
+) -> "cs.Recording | None":
     """Open the recording that an option names, or else one that the plan was made from.
+
+    ``through`` is what the user declares that no event shows.
 
     Of several chains it is the first recording that is still there. None: there is none.
     """
@@ -339,7 +343,7 @@ def recording_of(named: Path | None, plan: "cs.Plan | None" = None) -> "cs.Recor
         recorded = chain_plan.evidence.recording
         if named is None and recorded is not None and Path(recorded).is_dir():
             named = Path(recorded)
-    return None if named is None else cs.open_source(named)
+    return None if named is None else cs.open_source(named, through=through)
 
 
 def refuse_bound_alone(max_latency_ns: int | None, adapt: bool) -> None:

@@ -323,6 +323,7 @@ def watch(
     chain: list[str] | None = opt.option(
         "--chain FIRST..LAST", "A chain, by topics or nodes: /t1../t5 (may be repeated)."
     ),
+    through: list[str] | None = opt.THROUGH,
     plan: Path | None = opt.option(
         "--plan plan.yaml", "The plan in force: its chains, slots, and which outputs are late."
     ),
@@ -380,6 +381,7 @@ def watch(
     from chainshaper.monitor.watch import Watch, exporting
     from chainshaper.reporting.overviews import watch_tables
     from chainshaper.sources.preload import named_loops
+    from chainshaper.values.handed_over import parse_through
     from chainshaper.values.recording import refuse_existing
 
     named_loops.names_text(loop or [])
@@ -389,6 +391,7 @@ def watch(
         return
     known = opt.plan_in_force(plan)
     limits = Budget() if budget is None else load_budget(budget)
+    limits = limits.declaring(through or ())
     chains = _chains_to_watch(chain or [], known, limits, loop or [])
     if budget is not None or recorder != Path():
         refuse_existing(recorder / "watch-DATE-TIME")
@@ -410,6 +413,7 @@ def watch(
             longest_ns=longest,
             callbacks=bool(limits.callbacks),
             loops=loop or [],
+            through=parse_through(limits.through),
         )
         publish = _publisher(watched, until) if diagnostics else lambda _: None
         next_look, judged = time.monotonic_ns() + every, _judging(limits, watched, recorder)
@@ -537,6 +541,7 @@ def profile(
         "of containers, and executors with several threads.",
         rich_help_panel=opt.THREADS,
     ),
+    through: list[str] | None = opt.THROUGH,
     node: list[str] | None = opt.option(
         "--node NAME",
         "A node that gets the priority (may be repeated, the most urgent first). Default: the "
@@ -566,6 +571,7 @@ def profile(
     from chainshaper.flow.profiling_condition import check_profiling, profiled_cores, undelayed
     from chainshaper.linux.child_processes import check_command
     from chainshaper.planning.request import best_effort_cores
+    from chainshaper.values.handed_over import parse_through
     from chainshaper.values.recording import refuse_existing
 
     if not command:
@@ -579,7 +585,7 @@ def profile(
         raise InputError("--core is for one core, --cores for several: give one of them")
     if core is not None:
         request = cs.PlanRequest(cores=(core,))
-    cores, earlier = check_profiling(request.cores), opt.recording_of(like)
+    cores, earlier = check_profiling(request.cores), opt.recording_of(like, through=through or ())
     if len(cores) > 1 and not (earlier and chains):
         raise InputError("--cores are distributed by what chains do: add --chain and --like")
     core_of = {f"/{name.strip('/')}": cores[0] for name in node or ()}
@@ -600,6 +606,7 @@ def profile(
             buffer=buffer and buffer << 20,
             loops=loop or [],
             chain=chains[0] if chains else None,
+            through=parse_through(through or ()),
             scheduling=cs.profiling_condition(
                 core_of,
                 core_of or cores[0],

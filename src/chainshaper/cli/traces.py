@@ -190,6 +190,8 @@ def latency(
         tables.append(of_chain.data_age_table(analysis.data_age))
     if out.present(json, values, *tables):
         out.show_line(f"{of_chain.doubts_text(measurement)}; {out.lost_events(recording)}")
+        if values["promise"] is not None:
+            out.show_line(values["promise"]["text"])
         for path in drawn:
             out.show_line(path)
         out.notes(analysis.notes)
@@ -215,18 +217,20 @@ def budget(
     trace: list[Path] = opt.TRACE,
     output: Path = opt.option("--output -o FILE", "The budget file.", ...),
     chain: list[str] | None = opt.CHAINS,
+    through: list[str] | None = opt.THROUGH,
     room: float = opt.option("--room SHARE", "How far limits lie beyond what was measured.", 0.1),
 ) -> None:
     """Propose a budget: limits for chains, their hops and callbacks, as a recording has them.
 
-    It is a YAML file that you edit; `chainshaper check` says which recordings keep to it.
+    It is a YAML file that you edit; `chainshaper check` says which recordings keep to it. What
+    --through declares stands in it, too.
     """
     from chainshaper.monitor.budgets import propose_budget, save_budget
     from chainshaper.values.files import new_file
     from chainshaper.verify.measure import taken_chain
 
     new_file(output)
-    with out.opened("budget", trace) as (recording, _):
+    with out.opened("budget", trace, through) as (recording, _):
         proposed = propose_budget(recording, chain or [], room)
     out.show_line(save_budget(proposed, output))
     if not chain:
@@ -258,6 +262,7 @@ def check(
         "--baseline REC", "Recordings of before (may be repeated): is a callback slower now?"
     ),
     chain: list[str] | None = opt.CHAINS,
+    through: list[str] | None = opt.THROUGH,
     junit: Path | None = opt.option("--junit FILE", "Also write JUnit XML, for a CI system."),
     markdown: Path | None = opt.option("--markdown FILE", "Also write Markdown, for a review."),
     scheduler: str | None = opt.SCHEDULER,
@@ -275,6 +280,7 @@ def check(
     if budget is None and not baseline:
         raise InputError("say what to check against: --budget FILE, or --baseline REC")
     limits = budgets.Budget() if budget is None else budgets.load_budget(budget)
+    limits = limits.declaring(through or ())
     for file in filter(None, (junit, markdown)):
         new_file(file)
     judged_of: list[list[Judged]] = []  # for each recording
@@ -290,7 +296,9 @@ def check(
             from chainshaper.verify.slowdowns import slowdowns_in
 
             chains = chain or [of_chain.chain for of_chain in limits.chains]
-            compared, notes = slowdowns_in(paths, before, chains, report, scheduler)
+            compared, notes = slowdowns_in(
+                paths, before, chains, report, scheduler, through=limits.through
+            )
             out.notes(notes)
     every: list[Judged | Compared] = [*judged, *compared]
     if junit is not None:

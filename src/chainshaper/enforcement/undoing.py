@@ -105,6 +105,46 @@ class LoopStep:
 
 
 @dataclass(frozen=True)
+class LoopState:
+    """A chain's output and a loop that are kept in step, as they are now. Times are ns."""
+
+    chain: str
+    loop: str  # its node
+    moves: str  # what is moved: "output" or "loop"
+    lead_ns: int  # so long before the loop starts, the output's slot is to begin
+    is_there: bool  # whether the loop is seen
+    in_step: bool
+    waits_for: str | None  # why they are not in step; None: they are
+    moved_ns: int | None  # how much later than by itself comes what is moved; None: it was not yet
+    # How much later than the lead the loop starts behind the output, as measured; negative: sooner.
+    error_ns: int | None
+    drift_ppm: float | None  # of the loop's clock against that of the chain
+    age_ns: int | None  # of what the loop reads, from the chain's origin; None: not known yet
+    starts: int  # of the loop, over the last minute in step
+    misses: int  # of these, how many were off by more than the lead: their data are other ones
+
+    @property
+    def name(self) -> str:
+        """Text: both."""
+        return f"{self.chain} and the loop of {self.loop}"
+
+    @property
+    def text(self) -> str:
+        """How both are now, in a part of a sentence."""
+        if not self.in_step:
+            return f"{self.name} are not in step: {self.waits_for}"
+        parts = [f"lead {duration_text(self.lead_ns)}"]
+        if self.error_ns is not None:
+            parts.append(f"off by {self.error_ns / 1e6:+.3f} ms")
+        if self.drift_ppm is not None:
+            parts.append(f"drift {self.drift_ppm:+.1f} ppm")
+        if self.moved_ns is not None:
+            parts.append(f"{self.moves} moved by {duration_text(self.moved_ns)}")
+        parts.append(f"{self.misses} of {self.starts} starts missed in the last minute")
+        return f"{self.name} are in step: {', '.join(parts)}"
+
+
+@dataclass(frozen=True)
 class RunState:
     """The state of a run, as `run.json` shows it.
 
@@ -129,6 +169,7 @@ class RunState:
     ended_ns: int | None = None
     moves: tuple[SlotMove, ...] = ()  # the latest ones of each chain's gate
     steps: tuple[LoopStep, ...] = ()  # the latest ones of each loop that is kept in step
+    loops: tuple[LoopState, ...] = ()  # those, as they are now
 
 
 def save_run_state(folder: Path, state: RunState) -> None:

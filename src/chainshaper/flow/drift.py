@@ -13,8 +13,6 @@ INFOCOM 1999).
 """
 
 import math
-import os
-import threading
 from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
@@ -22,12 +20,13 @@ from itertools import pairwise
 from statistics import mean, median
 
 from chainshaper.enforcement.undoing import SlotMove
+from chainshaper.flow.background import Background
 from chainshaper.planning.adaptation import Tail
 from chainshaper.planning.chain_plan import Adaptation, ChainPlan, publish_slots
 from chainshaper.planning.margins import allowed_late_share
 from chainshaper.planning.offsets import chain_name
 from chainshaper.splicing.shaped_outputs import FollowedOutput
-from chainshaper.values.errors import ChainshaperError, OperationError
+from chainshaper.values.errors import ChainshaperError
 
 SEEN_NS = 250_000  # later than usual by so much, a thread was woken by its timer, not the slot
 MOVE_NS = 250_000  # slots move by no less
@@ -162,7 +161,6 @@ class SlotFollower:
         cores: Collection[int] = (),
     ) -> None:
         self.moves: tuple[SlotMove, ...] = ()
-        self.failure: ChainshaperError | None = None
         self._chain, self._put_in_force = chain, put_in_force
         assert chain.shaping_node is not None  # noqa: S101 - else the chain cannot be followed
         self._output = FollowedOutput(chain.shaping_node.output, pids)
@@ -177,33 +175,28 @@ class SlotFollower:
             earliest_ns,
             math.inf if chain.policy == "pipelined" else chain.cycle_ns,
         )
-        self._cores, self._stop = cores, threading.Event()
-        self._thread = threading.Thread(target=self._follow, name="slot-follower", daemon=True)
+        self._thread = Background("slot-follower", self._follow, "following", cores)
         self._thread.start()
+
+    @property
+    def failure(self) -> ChainshaperError | None:
+        """Why slots do not follow any more, also a place where they may not be; None: they do."""
+        return self._thread.failure
 
     def end(self) -> None:
         """Have the slots go back to where the plan has them, and follow no more."""
-        self._stop.set()
-        self._thread.join()
+        self._thread.end()
         self._output.close()
 
     def _follow(self) -> None:
         """Move the slots whenever latencies say so, until the end."""
-        if self._cores:
-            os.sched_setaffinity(0, self._cores)  # the calling thread's alone
         look_s = min(0.1, max(0.005, self._chain.cycle_ns / 2e9))
-        try:
-            while not self._stop.wait(look_s):
-                before_ns = self._tail.start_ns
-                for latency_ns in self._output.latencies():
-                    self._tail.add(latency_ns)
-                if self._tail.start_ns != before_ns:
-                    self._move(self._tail.start_ns, before_ns)
-        except ChainshaperError as error:  # also a place where slots may not be, beside others'
-            if not self._stop.is_set():
-                self.failure = error
-        except Exception as error:  # a thread that ends in silence follows no more
-            self.failure = OperationError(f"following has failed ({type(error).__name__}: {error})")
+        while not self._thread.stop.wait(look_s):
+            before_ns = self._tail.start_ns
+            for latency_ns in self._output.latencies():
+                self._tail.add(latency_ns)
+            if self._tail.start_ns != before_ns:
+                self._move(self._tail.start_ns, before_ns)
 
     def _move(self, start_ns: int, before_ns: int) -> None:
         """Move the slots, so that the last one opens at ``start_ns`` in place of ``before_ns``."""

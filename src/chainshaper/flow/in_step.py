@@ -15,14 +15,14 @@ Both repeat in time; what they have in common is the greatest common divisor of 
 loop. Moves are of less than a step, and later ones small, as the drift has it.
 """
 
-import os
-import threading
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
-from chainshaper.enforcement.undoing import LoopStep
+from chainshaper.enforcement.undoing import LoopState, LoopStep
+from chainshaper.flow.background import Background
 from chainshaper.flow.loop_phase import LoopPhase, PhaseTrack, phase_of
 from chainshaper.linux.threads import list_threads
 from chainshaper.planning.chain_plan import (
@@ -46,6 +46,7 @@ LOOK_S = 0.1
 STEPS = 50  # so many of the latest moves are shown
 _ORIGINS_NS = 20_000_000_000  # of the chain's origins, none is older
 _RESERVE = 0.05  # of a loop's period: so much more time than for its work is left to it
+_MINUTE_NS = 60_000_000_000
 _SEARCH_EVERY = 10  # looks from one search for the loop to the next
 
 
@@ -150,7 +151,6 @@ class InStep:
         assert loop is not None and loop.period_ns is not None  # noqa: S101 - as planned
         assert shaping is not None  # noqa: S101 - else there is no slot to move
         self.steps: tuple[LoopStep, ...] = ()
-        self.failure: ChainshaperError | None = None
         self.loop_moves: list[LoopMoved] = []
         self.chain, self.loop, self.period_ns = chain, loop, loop.period_ns
         self.step_ns, self._tolerance_ns = loop_common_ns(chain), tolerance_ns
@@ -169,9 +169,15 @@ class InStep:
         self._late_ns = 0  # the loop cannot be where it is to be, and starts so much later
         self._unreachable_ns = self.period_ns  # from here on a move changes the loop's rate
         self._looks = 0
-        self._cores, self._stop = cores, threading.Event()
-        self._thread = threading.Thread(target=self._follow, name="in-step", daemon=True)
+        self._off = deque[tuple[int, int]]()  # when a start was seen, and how far it was off
+        self._settles = False  # something was moved at the latest look
+        self._thread = Background("in-step", self._follow, "following", cores)
         self._thread.start()
+
+    @property
+    def failure(self) -> ChainshaperError | None:
+        """Why both are not kept in step any more; None: they are."""
+        return self._thread.failure
 
     @property
     def has_loop(self) -> bool:
@@ -214,25 +220,59 @@ class InStep:
         slot = self._slot_ns + (self._moved_ns if self.loop.in_step == "output" else 0)
         return slot + (start - origin.at_ns - slot) % self.step_ns
 
+    @property
+    def error_ns(self) -> int | None:
+        """How much later (ns) than the lead behind the output the loop starts; None: not yet known.
+
+        Negative: sooner. Of what is possible for the two periods, the smallest counts.
+        """
+        loop, origin = self._loops.phase, self._origins.phase
+        if loop is None or origin is None or self._mover is None:
+            return None
+        moved_ns = self._moved_ns or 0
+        start = loop.near(origin.at_ns) + (moved_ns if self.loop.in_step == "loop" else 0)
+        return self._off_ns(start, origin)
+
+    def _off_ns(self, start_ns: int, origin: LoopPhase) -> int:
+        """Return how much later than the lead behind the output a start of the loop is."""
+        slot = self._slot_ns + (self._moved_ns or 0 if self.loop.in_step == "output" else 0)
+        due = origin.near(start_ns - slot - self.loop.lead_ns) + slot + self.loop.lead_ns
+        return (start_ns - due + self.step_ns // 2) % self.step_ns - self.step_ns // 2
+
+    @property
+    def state(self) -> LoopState:
+        """How both are now."""
+        loop, origin = self._loops.phase, self._origins.phase
+        drift_ppm = None
+        if loop is not None and origin is not None:
+            drift_ppm = round(loop.drift_ppm - origin.drift_ppm, 1)
+        waits_for = self.waits_for if self.has_loop else "no such loop is seen to sleep"
+        return LoopState(
+            chain=chain_name(self.chain),
+            loop=self.loop.node,
+            moves=self.loop.in_step or "",
+            lead_ns=self.loop.lead_ns,
+            is_there=self.has_loop,
+            in_step=self.is_in_step,
+            waits_for=None if self.is_in_step else waits_for,
+            moved_ns=self._moved_ns,
+            error_ns=self.error_ns,
+            drift_ppm=drift_ppm,
+            age_ns=self.age_ns,
+            starts=len(self._off),
+            misses=sum(abs(off) > self.loop.lead_ns for _, off in self._off),
+        )
+
     def end(self) -> None:
         """Have all be where the plan and the loop have it, and follow no more."""
-        self._stop.set()
-        self._thread.join()
+        self._thread.end()
         self._output.close()
         if self._mover is not None:
             self._mover.close()
 
     def _follow(self) -> None:
-        if self._cores:
-            os.sched_setaffinity(0, self._cores)  # the calling thread's alone
-        try:
-            while not self._stop.wait(LOOK_S):
-                self.look()
-        except ChainshaperError as error:
-            if not self._stop.is_set():
-                self.failure = error
-        except Exception as error:  # a thread that ends in silence follows no more
-            self.failure = OperationError(f"following has failed ({type(error).__name__}: {error})")
+        while not self._thread.stop.wait(LOOK_S):
+            self.look()
 
     def look(self) -> None:
         """Look where both are, and move what is to be moved."""
@@ -269,6 +309,7 @@ class InStep:
             self.tid = self._mover.tid
         starts, moves = self._mover.seen()
         self.loop_moves += moves
+        self._judge(starts, any(self._is_far(move.added_ns) for move in moves))
         self._loops.saw(self._own.of(starts, moves))
         if self._loops.restarts > self._restarts:
             self._restarts, self._elsewhere = self._loops.restarts, True
@@ -285,6 +326,20 @@ class InStep:
                     f"moved by {duration_text(move.asked_ns)} it left instances out: too little"
                     " time is left for its work, so it is not moved so far any more",
                 )
+
+    def _is_far(self, moved_ns: int) -> bool:
+        """Return whether starts may miss while a move by so much comes into force."""
+        return abs(moved_ns) > self.loop.lead_ns // 4
+
+    def _judge(self, starts: Sequence[int], has_moved: bool) -> None:
+        """Note how far starts were from their place, as far as they were to be there."""
+        origin, now = self._origins.phase, time.monotonic_ns()
+        while self._off and self._off[0][0] < now - _MINUTE_NS:
+            self._off.popleft()
+        # Between two looks the output, or the loop, moves from one place to the next.
+        settles, self._settles = self._settles or has_moved, False
+        if origin is not None and self.is_in_step and not (settles or self._elsewhere):
+            self._off += ((now, self._off_ns(start, origin)) for start in starts)
 
     def _move_loop(self, mover: LoopStarts, loop: LoopPhase, origin: LoopPhase) -> None:
         output = origin.at_ns + self._slot_ns + self.loop.lead_ns
@@ -337,6 +392,7 @@ class InStep:
             why = "the drift has moved it to the end of what is possible, so it goes a step further"
         else:
             why = f"the clocks drift apart by {loop.drift_ppm - origin.drift_ppm:+.1f} ppm"
+        self._settles = before is None or self._is_far(moved_ns - before)
         self._moved_ns, self._elsewhere = moved_ns, False
         self._note(moved_ns, why)
 

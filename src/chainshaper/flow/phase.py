@@ -11,8 +11,6 @@ of them; as whom we may not run, in ours.
 """
 
 import math
-import os
-import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -24,12 +22,13 @@ import numpy as np
 import numpy.typing as npt
 
 from chainshaper.enforcement.node_threads import Allocation
+from chainshaper.flow.background import Background
 from chainshaper.linux.scheduling import become_fifo, set_state, state_of
 from chainshaper.linux.threads import has_ended, start_of
 from chainshaper.planning.chain_plan import ShapingNode
 from chainshaper.splicing.shaped_outputs import ask_phase
 from chainshaper.values.durations import duration_text
-from chainshaper.values.errors import OperationError
+from chainshaper.values.errors import ChainshaperError, OperationError
 
 if TYPE_CHECKING:
     from chainshaper.sources.ros import Script
@@ -235,7 +234,6 @@ class DriftWatch:
     * ``latest_ns``: how far the beginning is from where it is expected (None: not seen yet).
     * ``looks``: how many looks have seen the thread.
     * ``look_soon``: set it, and the next look comes after a second.
-    * ``failure``: why the watch has ended, as half a sentence.
     """
 
     EVERY_S, SOON_S = 10.0, 1.0
@@ -255,10 +253,15 @@ class DriftWatch:
         self.latest_ns: int | None = None
         self._before_ns = 0  # what the look before saw
         self.looks, self.look_soon = 0, False
-        self.failure: str | None = None
         self._threads, self._cycle_ns, self._expected_ns = (pid, tids), cycle_ns, expected_ns
-        self._slots, self._cores, self._stop = slots, cores, threading.Event()
-        threading.Thread(target=self._look_until_over, name="drift-watch", daemon=True).start()
+        self._slots, self._cores = slots, cores
+        self._thread = Background("drift-watch", self._look_again, "looking for it", cores)
+        self._thread.start()
+
+    @property
+    def failure(self) -> ChainshaperError | None:
+        """Why the watch has ended; None: it has not, or one of the threads has."""
+        return self._thread.failure
 
     def expect(self, expected_ns: int) -> None:
         """Expect the thread to begin elsewhere from now on; forget where it began until now."""
@@ -268,7 +271,7 @@ class DriftWatch:
 
     def end(self) -> None:
         """Look no more, once the look that is under way is over."""
-        self._stop.set()
+        self._thread.end(waits=False)
 
     @property
     def surely_ns(self) -> int | None:
@@ -278,23 +281,14 @@ class DriftWatch:
         """
         return None if self.latest_ns is None else min(self.latest_ns, self._before_ns)
 
-    def _look_until_over(self) -> None:
-        """Look again and again; note why that has failed, if it has."""
-        try:
-            self._look_again()
-        except Exception as error:  # a thread that ends in silence sees no drift
-            self.failure = f"looking for it has failed ({type(error).__name__}: {error})"
-
     def _look_again(self) -> None:
         """Look every ten seconds, or after one if it is asked for, until the end."""
-        if self._cores:
-            os.sched_setaffinity(0, self._cores)  # the calling thread's alone
         near_ns: int | None = self._expected_ns
         with suppress(OperationError):  # the thread has ended
-            while not self._stop.is_set():
+            while not self._thread.stop.is_set():
                 until = time.monotonic() + self.EVERY_S
                 while time.monotonic() < until and not self.look_soon:
-                    if self._stop.wait(self.SOON_S):
+                    if self._thread.stop.wait(self.SOON_S):
                         return
                 was_asked, self.look_soon = self.look_soon, False
                 expected_ns = self._expected_ns

@@ -47,6 +47,7 @@ from chainshaper.values import recording as recordings
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 from chainshaper.values.files import open_to_all, rename_output
+from chainshaper.values.handed_over import Through
 from chainshaper.values.leftovers import claimed, leftover_text, leftovers
 from chainshaper.values.recording import EndpointInfo, Recording, ThreadInfo
 from chainshaper.workload.stall_meter import StallWatch, far_from, stalls_watched
@@ -116,6 +117,7 @@ def record_command(
     buffer: int | None = None,
     chain: str | None = None,
     loops: Sequence[str] = (),
+    through: Through = (),
     scheduling: Scheduling | None = None,
     plan: Plan | None = None,
     gate_logs: Sequence[Path] = (),
@@ -132,8 +134,9 @@ def record_command(
     (as :func:`.find_threads`). Without ``source`` it is `preload`, or `lttng` where there is no
     command, or a ``buffer`` (the size of LTTng's of a core, in bytes). ``loops`` are names of nodes
     and threads whose loops are recorded although they publish nothing (`preload` only). ``chain``
-    is noted as the chain of interest, ``plan`` as the plan in force; ``gate_logs`` are where its
-    shaping nodes note what they do. ``watch_stalls`` watches every core for stalls (2 % of it).
+    is noted as the chain of interest, ``through`` as what is declared of it, ``plan`` as the plan
+    in force; ``gate_logs`` are where its shaping nodes note what they do. ``watch_stalls`` watches
+    every core for stalls (2 % of it).
     ``ask_qos`` has ROS 2 asked for types and QoS of topics, which takes it seconds.
 
     Raises InputError: ``output`` exists, or no such command, process or source does. PlatformError:
@@ -168,7 +171,7 @@ def record_command(
         try:
             _trace(run, scheduling, command_stdout, stalls=watch_stalls, ask_qos=ask_qos)
             progress(1.0, "reading the events")
-            recording = _written(output, run, chain, plan)
+            recording = _written(output, run, chain, through, plan)
             run.tracer.written()
         except BaseException as error:  # the trace may be of hours: nothing costs it
             if not run.ended_ns:
@@ -329,7 +332,9 @@ def _look(run: _RecordedRun) -> None:
         run.in_force_ns = run.stalls.begin(far_from(releases_so_far(run.gate_logs)))
 
 
-def _written(output: Path, run: _RecordedRun, chain: str | None, plan: Plan | None) -> Recording:
+def _written(
+    output: Path, run: _RecordedRun, chain: str | None, through: Through, plan: Plan | None
+) -> Recording:
     """Write the recording: the events, and all else that is known of the run.
 
     Raises OperationError: nothing was traced, or the scheduling was never in force.
@@ -374,6 +379,7 @@ def _written(output: Path, run: _RecordedRun, chain: str | None, plan: Plan | No
         "realtime": run.schedule is not None or in_real_time,
         "stall_meter": run.stalls.info,
         "chain": chain,
+        "through": through,
         "plan": None if plan is None else plan_values(plan),
         "in_force": None if plan is None else recordings.InForceInfo(since_ns=since_ns),
         "notes": tuple(notes),

@@ -1,6 +1,7 @@
 """Budgets: what a chain, its hops, callbacks and loops may take, and which recordings keep to it.
 
     format: 1
+    through: [/command=/motor]
     chains:
       - {chain: /t1../t5, maximum: 80ms, percentiles: {'99': 75ms}, jitter: 40ms, missing: 1%,
          hops: [{topic: /t3, communication: 1ms, computation: 22ms}],
@@ -12,13 +13,14 @@
       - {node: /controller_manager, publishes: /command, shortest_period: 9ms, period: 11ms,
          start_jitter: 500us, overruns: 1%}
 
-Limits hold for all cycles, also those that the machine disturbed. A limit that only these break is
-broken, and its message says so. ``missing`` is the share of outputs that were late or never came;
-``starts`` is the topic that starts a callback, or the declared period of its timer, as
-`chainshaper callbacks` shows it. ``age_at_loop`` is about the data of the chain's last loop, over
-all of its cycles; ``never`` and ``again`` are shares of the messages: used in no cycle, and in
-several. ``overruns`` is a share of a loop's instances. ``minimum`` and ``shortest_period`` are the
-least that is allowed, all others the most.
+``through`` is what no event shows, as `--through` declares it: messages of the first topic go into
+those of the second. Limits hold for all cycles, also those that the machine disturbed. A limit that
+only these break is broken, and its message says so. ``missing`` is the share of outputs that were
+late or never came; ``starts`` is the topic that starts a callback, or the declared period of its
+timer, as `chainshaper callbacks` shows it. ``age_at_loop`` is about the data of the chain's last
+loop, over all of its cycles; ``never`` and ``again`` are shares of the messages: used in no cycle,
+and in several. ``overruns`` is a share of a loop's instances. ``minimum`` and ``shortest_period``
+are the least that is allowed, all others the most.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -34,6 +36,7 @@ from pydantic import BeforeValidator, Field, PlainSerializer, SerializationInfo
 from chainshaper.analysis import recorded_flow
 from chainshaper.analysis.contradictions import refuse_contradicted
 from chainshaper.analysis.data_age import DataAge, use_shares
+from chainshaper.analysis.graph import with_possible_hand_overs
 from chainshaper.analysis.latency import (
     PERCENTILES,
     LatencyStatistics,
@@ -42,10 +45,11 @@ from chainshaper.analysis.latency import (
     longest_times,
 )
 from chainshaper.analysis.loop_rates import LoopRate, loop_instances, loop_label, loop_rates
-from chainshaper.sources import open_source
+from chainshaper.sources import open_source, with_declared
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import ChainshaperError, InputError, shown
 from chainshaper.values.files import new_file, write_whole
+from chainshaper.values.handed_over import HandedOver, parse_through, through_texts
 from chainshaper.values.many_tasks import computed
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import AS_YAML, Part, PositiveDuration, read_model
@@ -147,9 +151,19 @@ class Budget(Part):
     """A budget file."""
 
     format: Literal[1] = 1
+    # What no event shows (values/handed_over.py): /command=/motor
+    through: tuple[HandedOver, ...] = Field(default=(), strict=False)
     chains: tuple[ChainBudget, ...] = Field(default=(), strict=False)
     callbacks: tuple[CallbackBudget, ...] = Field(default=(), strict=False)
     loops: tuple[LoopBudget, ...] = Field(default=(), strict=False)
+
+    def declaring(self, through: Sequence[str]) -> "Budget":
+        """Return the budget with what `--through` declares, beside its own.
+
+        Raises InputError: a text declares nothing.
+        """
+        texts = dict.fromkeys((*self.through, *through_texts(parse_through(through))))
+        return self.model_copy(update={"through": tuple(texts)})
 
 
 @dataclass(frozen=True)
@@ -215,7 +229,8 @@ def save_budget(budget: Budget, path: str | Path) -> Path:
 def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float = ROOM) -> Budget:
     """Propose limits for chains, hops, callbacks and loops: what was measured, and ``room`` beyond.
 
-    Without ``chains``, for the chain that the recording names, or the only one in it.
+    Without ``chains``, for the chain that the recording names, or the only one in it. What is
+    declared of the recording (`--through`) is in the budget, too.
 
     Raises InputError: no such chain.
     """
@@ -254,7 +269,8 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
         for (node, starts), (took, used, _) in longest_times(flow).items()
     )
     loops = tuple(_proposed_loop(rate, room) for rate in loop_rates(loop_instances(flow)))
-    return Budget(chains=tuple(of_chains), callbacks=callbacks, loops=loops)
+    through = through_texts(recording.info.through)
+    return Budget(through=through, chains=tuple(of_chains), callbacks=callbacks, loops=loops)
 
 
 def _most(ns: float | None, room: float) -> int | None:
@@ -310,16 +326,16 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
     """
     judged: list[Judged] = []
     name = name or str(recording.path)
-    flow = recorded_flow(recording)
+    recording = with_declared(recording, parse_through(budget.through))
+    flow, doubts = with_possible_hand_overs(recorded_flow(recording))
     for chain in budget.chains:
         try:
             analysis = measure_latency(recording, chain.chain, flow=flow).analysis
         except InputError as error:
+            reason = "; ".join([str(error), *doubts])
             for figure, limit, measured in _chain_limits(chain, None, None):
-                judged.append(
-                    Judged(name, chain.chain, figure, limit, measured, because=str(error))
-                )
-            judged += _judged_age(name, chain, None, None, str(error))
+                judged.append(Judged(name, chain.chain, figure, limit, measured, because=reason))
+            judged += _judged_age(name, chain, None, None, reason)
             continue
         parts = hop_breakdown(analysis)
         hops = list(_judged_hops(name, chain, _longest_parts(parts)))

@@ -41,6 +41,7 @@ from chainshaper.analysis.latency import (
 from chainshaper.analysis.messages import has_stampless
 from chainshaper.analysis.objects import Objects, resolve_objects
 from chainshaper.analysis.traversals import OWES_NO_OUTPUT, Traversals
+from chainshaper.enforcement.undoing import LoopState, find_runs
 from chainshaper.monitor.metrics import (
     EVERY_MS,
     LONGEST_END_MS,
@@ -50,6 +51,7 @@ from chainshaper.monitor.metrics import (
 )
 from chainshaper.monitor.watched_loops import LoopNow, WatchedLoops
 from chainshaper.planning import ChainPlan, Plan
+from chainshaper.planning.plan import declared_in
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.robot.clocks import clock_offset
 from chainshaper.sources.preload import (
@@ -68,6 +70,7 @@ from chainshaper.values import events
 from chainshaper.values.application import ApplicationGraph, Callback, Chain
 from chainshaper.values.errors import InputError, OperationError, extra_library
 from chainshaper.values.events import EventTables
+from chainshaper.values.handed_over import Through
 from chainshaper.values.recording import InForceInfo, Recording, refuse_existing, write_recording
 from chainshaper.verify.measure import PARTS
 from chainshaper.verify.predictions import due_of
@@ -153,15 +156,17 @@ class Seen:
     left_out: tuple[str, ...] = ()  # which processes with the library are not seen, and why
     loops: tuple[LoopNow, ...] = ()
     missed: tuple[str, ...] = ()  # which loops missed their rate, when, and who ran on their core
+    in_step: tuple[LoopState, ...] = ()  # loops that runs of this machine keep in step
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self)
 
     def as_diagnostics(self) -> list[dict[str, Any]]:
-        """Return a status for each chain, as `/diagnostics` has it.
+        """Return a status for each chain, and each loop in step, as `/diagnostics` has it.
 
-        ERROR: there was no output in the last minute. WARN: an output was late or never came. They
-        are for :func:`~chainshaper.sources.ros.publishing_diagnostics`.
+        ERROR: there was no output in the last minute, or the loop is not there. WARN: an output was
+        late or never came; the loop is not in step, or missed it in the last minute. They are for
+        :func:`~chainshaper.sources.ros.publishing_diagnostics`.
         """
         statuses = []
         for chain in self.chains:
@@ -179,7 +184,28 @@ class Seen:
                         values[f"{statistic} of the last {span} [ms]"] = f"{ns / 1e6:.3f}"
             about = {"name": f"chainshaper: {chain.chain}", "level": level, "message": text}
             statuses.append({**about, "values": values})
-        return statuses
+        return [*statuses, *map(self._status_of, self.in_step)]
+
+    def _status_of(self, loop: LoopState) -> dict[str, Any]:
+        """Return the status of a loop in step."""
+        level = 2 if not loop.is_there else int(loop.misses > 0 or not loop.in_step)
+        times = {
+            "lead [ms]": loop.lead_ns,
+            "phase error [ms]": loop.error_ns,
+            "moved by [ms]": loop.moved_ns,
+            "age of its data [ms]": loop.age_ns,
+        }
+        values = {name: f"{ns / 1e6:.3f}" for name, ns in times.items() if ns is not None}
+        if loop.drift_ppm is not None:
+            values["drift [ppm]"] = f"{loop.drift_ppm:.1f}"
+        values["moved"] = loop.moves
+        values["starts in the last minute"] = str(loop.starts)
+        values["misses in the last minute"] = str(loop.misses)
+        missed = [watched.misses for watched in self.loops if watched.rate.node == loop.loop]
+        if missed:
+            values["misses of its rate in the last minute"] = str(sum(missed))
+        about = {"name": f"chainshaper: {loop.name} in step", "level": level, "message": loop.text}
+        return {**about, "values": values}
 
 
 _SAME = ("node", "kind", "topic", "declared_ns")
@@ -303,8 +329,9 @@ class Watch:
     ``chains`` are written as for `--chain`. Processes of ``users`` are followed. A cycle that takes
     longer than ``longest_ns`` counts as incomplete. ``plan`` says when outputs are due. With
     ``callbacks`` the watch follows the times of all callbacks, too. ``loops`` are names of loops
-    that are looked for; all that are seen are followed. Call :meth:`read` every tenth of a second
-    or so between two looks, or events are overwritten before they are read.
+    that are looked for; all that are seen are followed. ``through`` is what no event shows, and the
+    user declares (:mod:`~chainshaper.values.handed_over`). Call :meth:`read` every tenth of a
+    second or so between two looks, or events are overwritten before they are read.
     """
 
     def __init__(
@@ -316,7 +343,10 @@ class Watch:
         longest_ns: int = 2 * SECOND,
         callbacks: bool = False,
         loops: Sequence[str] = (),
+        through: Through = (),
     ) -> None:
+        declared = () if plan is None else declared_in(plan)
+        self.through = tuple(dict.fromkeys((*through, *declared)))
         self._named_loops = loops
         self.callbacks: deque[tuple[int, Any]] | None = deque() if callbacks else None
         self.loops = WatchedLoops()
@@ -412,6 +442,7 @@ class Watch:
         tables = self._tables(since)
         objects, ended = self._objects(tables, since), self._ended()
         flow = data_flow(tables, self._clock_offset_ns, objects, ended=ended)
+        flow = replace(flow, through=self.through)
         moved = dict[str, int]()
         if self.plan:  # a page of another user says nothing of the outputs that are watched
             watched = (output for output in find_outputs() if output.user in self.users)
@@ -420,11 +451,12 @@ class Watch:
         stampless = has_stampless(flow.publications)
         clear_ns = self._stepped_ns if stampless else 0
         within = pl.col("start").is_between(self._over_ns, over, "right")
-        graph = graph_of(flow)
+        doubts = list[str]()
+        graph = graph_of(flow, doubts)
         for chain in self.chains:
             _forget(chain.hops, now - SPANS["minute"])
             _forget(chain.ages, now - SPANS["minute"])
-            traversed = self._judged(chain, flow, graph)
+            traversed = self._judged(chain, flow, graph, doubts)
             if traversed is None:
                 continue
             judged, hops, traversals = traversed
@@ -456,12 +488,21 @@ class Watch:
             left_out=tuple(self._left_out.values()),
             loops=self.loops.now(),
             missed=tuple(miss.text for miss in missed),
+            in_step=tuple(self._in_step()),
         )
 
+    def _in_step(self) -> Iterator[LoopState]:
+        """Yield the loops that runs keep in step whose plans are in force."""
+        for journal, state in find_runs():
+            if state is not None and journal.owner is not None:
+                yield from state.loops
+
     def _judged(
-        self, watched: _Chain, flow: DataFlow, graph: ApplicationGraph
+        self, watched: _Chain, flow: DataFlow, graph: ApplicationGraph, doubts: Sequence[str]
     ) -> tuple[pl.DataFrame, pl.DataFrame, Traversals] | None:
         """Return the judged traversals of a chain, their hops, and all of them; None: no chain.
+
+        ``doubts`` say what was declared and cannot be, which may be why there is no chain.
 
         Where only its beginning is in the graph, each cycle that began is incomplete.
         """
@@ -470,7 +511,7 @@ class Watch:
             chain = find_chain(graph, watched.text)
         except InputError as error:
             if self.processes:
-                watched.problem = str(error)
+                watched.problem = "; ".join([str(error), *doubts])
             else:
                 watched.problem = " ".join(self._left_out.values()) or NO_PROCESS
             # Every cycle that is over had its events here: none of them has arrived.
@@ -591,6 +632,7 @@ class Watch:
             "clock_offset_ns": self._clock_offset_ns,
             "pid_namespace": own_pid_namespace(),
             "chain": self.chains[0].text if self.chains else None,
+            "through": self.through,
             "notes": (
                 "the last seconds before it was asked for; objects from before them are there",
                 *reasons,
@@ -713,6 +755,13 @@ _METRICS = {
     "loop.start_jitter": ("gauge", "s", "Jitter of a loop's starts over the last minute"),
     "loop.overruns": ("gauge", "1", "Share of a loop's instances that overran in the last minute"),
     "loop.misses": ("gauge", "1", "Instances of a loop that missed its rate in the last minute"),
+    "loop.step_lead": ("gauge", "s", "Lead of an output before a loop in step"),
+    "loop.step_error": ("gauge", "s", "How much later than the lead a loop in step starts"),
+    "loop.step_moved": ("gauge", "s", "How far an output or a loop is moved to be in step"),
+    "loop.step_drift": ("gauge", "1", "Drift of a loop's clock against its chain's, as a share"),
+    "loop.step_starts": ("gauge", "1", "Starts of a loop in step in the last minute"),
+    "loop.step_misses": ("gauge", "1", "Starts off their place in step in the last minute"),
+    "loop.in_step": ("gauge", "1", "Whether output and loop are in step: 1, or 0"),
     "events.lost": ("counter", "1", "Events that were overwritten before they were read"),
 }
 
@@ -729,19 +778,40 @@ def _values(seen: Seen) -> Iterator[tuple[str, float, dict[str, str]]]:
         if loop.rate.overrun_share is not None:
             yield "loop.overruns", loop.rate.overrun_share, of_loop
         yield "loop.misses", float(loop.misses), of_loop
+    for step in seen.in_step:
+        yield from _values_in_step(step)
     for chain in seen.chains:
-        named = {"chain": chain.chain}
-        for span, figures in chain.spans.items():
-            statistics: dict[str, int | None] = {"min": figures.min_ns, "max": figures.max_ns}
-            for percentile, reached_ns in figures.percentiles_ns.items():
-                statistics[f"p{percentile}"] = reached_ns
-            for statistic, figure_ns in statistics.items():
-                if figure_ns is not None:
-                    about = {**named, "span": span, "statistic": statistic}
-                    yield "chain.latency", figure_ns / SECOND, about
-        for hop in chain.hops:
-            about = {**named, "node": hop.node, "topic": hop.topic}
-            for part in PARTS:
-                yield "hop.time", getattr(hop, f"{part}_ns") / SECOND, {**about, "part": part}
-        for outcome, count in chain.counted.items():
-            yield "chain.cycles", count, {**named, "outcome": outcome}
+        yield from _values_of(chain)
+
+
+def _values_of(chain: ChainNow) -> Iterator[tuple[str, float, dict[str, str]]]:
+    """Yield the values of a chain."""
+    named = {"chain": chain.chain}
+    for span, figures in chain.spans.items():
+        statistics: dict[str, int | None] = {"min": figures.min_ns, "max": figures.max_ns}
+        for percentile, reached_ns in figures.percentiles_ns.items():
+            statistics[f"p{percentile}"] = reached_ns
+        for statistic, figure_ns in statistics.items():
+            if figure_ns is not None:
+                about = {**named, "span": span, "statistic": statistic}
+                yield "chain.latency", figure_ns / SECOND, about
+    for hop in chain.hops:
+        about = {**named, "node": hop.node, "topic": hop.topic}
+        for part in PARTS:
+            yield "hop.time", getattr(hop, f"{part}_ns") / SECOND, {**about, "part": part}
+    for outcome, count in chain.counted.items():
+        yield "chain.cycles", count, {**named, "outcome": outcome}
+
+
+def _values_in_step(step: LoopState) -> Iterator[tuple[str, float, dict[str, str]]]:
+    """Yield the values of a loop in step."""
+    both = {"chain": step.chain, "loop": step.loop, "moves": step.moves}
+    yield "loop.in_step", float(step.in_step), both
+    yield "loop.step_lead", step.lead_ns / SECOND, both
+    for figure, step_ns in (("error", step.error_ns), ("moved", step.moved_ns)):
+        if step_ns is not None:
+            yield f"loop.step_{figure}", step_ns / SECOND, both
+    if step.drift_ppm is not None:
+        yield "loop.step_drift", step.drift_ppm * 1e-6, both
+    yield "loop.step_starts", float(step.starts), both
+    yield "loop.step_misses", float(step.misses), both

@@ -30,6 +30,7 @@ from chainshaper.values.durations import (
     parse_duration,
 )
 from chainshaper.values.errors import shown
+from chainshaper.values.handed_over import HandedOver
 from chainshaper.values.notebook import notebook_html
 from chainshaper.values.plan_choices import (
     EqualPriorities,
@@ -106,6 +107,8 @@ class ChainOfPlan(Part):
     output: FullName | None = None  # its last topic
     publisher: FullName | None = None  # the node that publishes the output
     output_depth: FromOne | None = None  # history depth of the output's writer
+    # What no event shows of the chain, and the user has declared (values/handed_over.py): /in=/out
+    through: Annotated[tuple[HandedOver, ...], Field(strict=False)] = ()
     period_ns: PositiveDuration
 
 

@@ -33,6 +33,7 @@ from chainshaper.planning.overruns import in_cycle, slots_without, united, with_
 from chainshaper.planning.overruns import open_until_done as chain_open_until_done
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError
+from chainshaper.values.handed_over import Through, parse_through
 from chainshaper.values.notebook import notebook_html
 from chainshaper.values.yaml_file import Part, wrong_value, wrong_values_refused
 
@@ -228,6 +229,11 @@ def plan_of_chain(plan: Plan, output: str | None) -> ChainPlan | None:
         if chain_plan.chain.output is None or output in named:
             return chain_plan
     return None
+
+
+def declared_in(plan: Plan) -> Through:
+    """Return what is declared of the plan's chains that no event shows."""
+    return parse_through([text for chain_plan in plan.chains for text in chain_plan.chain.through])
 
 
 def open_until_done(plan: Plan, waits_ns: Sequence[int] = ()) -> Plan:

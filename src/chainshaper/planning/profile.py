@@ -176,6 +176,7 @@ class Profile:
     # How it ran and was recorded ----------------------------------------------------------------
     fifo_priority: int = 84  # for the shaping node: above the executor that publishes the output
     output_depth: int | None = None  # history depth of the output's writer
+    through: tuple[str, ...] = ()  # what the user has declared: /in=/out
     recording: str | None = None  # the recording's path
     incomplete: int = 0  # traversals without an end
     unpublished: int = 0  # those of them that the application ended without a publication

@@ -507,6 +507,7 @@ def _shaped(
     values = {
         name: getattr(profile, name) for name in Evidence.model_fields if hasattr(profile, name)
     }
+    values["through"] = profile.through
     if request.publication == "asynchronous":
         if profile.asynchronous is False:
             reason = f"{last} has no thread that publishes for it: plan with --publication"

@@ -108,6 +108,7 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
         "incomplete_by_reason": analysis.incomplete,
         "silent": analysis.silent,
         "data_age": data_age_json(analysis.data_age),
+        "promise": promise_json(measurement),
         "overruns": None if overruns is None else sum(overruns.values()),
         "overruns_by_policy": overruns,
         "overrun_outcomes": {
@@ -192,6 +193,16 @@ def latency_table(measurement: Measurement) -> ResultTable:
         title = "longer than the period" if name == LATE[0] and measurement.plan is None else name
         table.add(title, *cells, detail=title in ("median", "99th percentile"))
     return table
+
+
+def promise_json(measurement: Measurement) -> dict[str, Any] | None:
+    """Whether what a plan promised was kept, as plain data; None: no plan was in force."""
+    if measurement.plan is None or measurement.prediction is None:
+        return None
+    met, text = verdict(measurement)
+    age = measurement.age
+    values = None if age is None else {**asdict(age), "kept": age.kept}
+    return {"met": met, "text": text, "age": values}
 
 
 def data_age_json(age: DataAge | None) -> dict[str, Any] | None:
@@ -347,8 +358,15 @@ def verdict(measurement: Measurement) -> tuple[bool | None, str]:
         return None, f"{name}: no plan was in force, so nothing was promised"
     effect = stall_effect(measurement)
     aside = "" if effect is None else f"; {effect}"
-    if judged.broken:
-        return False, f"{name}: promise broken: {'; '.join(judged.broken)}{aside}"
+    age = measurement.age
+    broken = (*judged.broken, *(() if age is None else age.broken))
+    if broken:
+        return False, f"{name}: promise broken: {'; '.join(broken)}{aside}"
+    if age is not None:
+        aside = f"; {age.text}{aside}"
+    elif measurement.plan.loop is not None:
+        loop = f"the loop of {measurement.plan.loop.node}"
+        aside = f"; how old the data of {loop} are is not known: it is not in the recording{aside}"
     if judged.mean.measured_ns is None:
         return None, f"{name}: no undisturbed cycle to judge the promise by{aside}"
     met = f"{name}: promise met: {judged.jitter_text}; {judged.outputs.text}"
@@ -437,8 +455,11 @@ def headline(names: Sequence[str], measurements: Sequence[Measurement]) -> str:
     aside = f" {effect[0].upper()}{effect[1:]}." if effect is not None else ""
     if judged is None:
         return f"{text}.{aside}"
-    if judged.broken:
-        return f"{text}; differs from the prediction: {'; '.join(judged.broken)}.{aside}"
+    age = measurements[-1].age
+    broken = (*judged.broken, *(() if age is None else age.broken))
+    aside = f" {age.text[0].upper()}{age.text[1:]}.{aside}" if age is not None else aside
+    if broken:
+        return f"{text}; differs from the prediction: {'; '.join(broken)}.{aside}"
     holds = {figure.holds for figure in (judged.mean, judged.max, judged.jitter)}
     verdict = "not judged" if holds == {None} else "as predicted"
     return f"{text}; {verdict}, {judged.outputs.text}.{aside}"

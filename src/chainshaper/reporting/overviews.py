@@ -16,7 +16,7 @@ from chainshaper.analysis.contradictions import Contradiction
 from chainshaper.enforcement.journal import Journal
 from chainshaper.enforcement.node_threads import Allocation, NodeThread
 from chainshaper.enforcement.thread_scheduling import WantedScheduling
-from chainshaper.enforcement.undoing import RunState, ServerState
+from chainshaper.enforcement.undoing import LoopState, RunState, ServerState
 from chainshaper.linux.threads import POLICIES
 from chainshaper.planning import BandChoice, ChainPlan, band_predictions, publish_slots
 from chainshaper.planning.chain_plan import slot_text
@@ -554,6 +554,8 @@ def servers_table(state: RunState) -> ResultTable:
             table.caption += f"; {move.text}"
         for step in {(latest.chain, latest.loop): latest for latest in state.steps}.values():
             table.caption += f"; {step.text}"
+        for loop in state.loops:
+            table.caption += f"; {loop.text}"
     for server in state.servers:
         slots = " ".join(map(slot_text, server.slots[:MOST_SLOTS]))
         # A server of several chains has slots over the whole hyper-period.
@@ -649,6 +651,8 @@ def watch_tables(seen: "Seen") -> list[ResultTable]:
             tables.append(_age_now_table(chain.age))
     if seen.loops or not tables:
         tables.append(_loops_now_table(seen.loops))
+    if seen.in_step:
+        tables.append(_in_step_table(seen.in_step))
     lost = f"; {seen.lost} events lost" if seen.lost else ""
     if unclear := sum(chain.counted["unclear"] for chain in seen.chains):
         lost += f"; {unclear} cycles unclear: the clock was set"
@@ -658,6 +662,20 @@ def watch_tables(seen: "Seen") -> list[ResultTable]:
     problem = tables[-1].caption
     tables[-1].caption = f"{problem}; {nodes}{lost}" if problem else f"{nodes}{lost}"
     return tables
+
+
+def _in_step_table(loops: Sequence[LoopState]) -> ResultTable:
+    """Make a table of loops that are kept in step with outputs."""
+    names = ("lead", "off by", "moved by", "age", "drift [ppm]", "starts", "missed")
+    columns = [*words("in step [ms]", "loop", "moves"), *figures(*names)]
+    reasons = "; ".join(loop.text for loop in loops if not loop.in_step)
+    table = ResultTable("", columns, reasons or None)
+    for loop in loops:
+        times = (loop.lead_ns, loop.error_ns, loop.moved_ns, loop.age_ns)
+        drift = ABSENT if loop.drift_ppm is None else f"{loop.drift_ppm:+.1f}"
+        counted = (loop.starts, loop.misses)
+        table.add(loop.chain, loop.loop, loop.moves, *map(ms, times), drift, *counted)
+    return table
 
 
 def _age_now_table(age: "AgeNow") -> ResultTable:

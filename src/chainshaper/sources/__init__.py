@@ -12,7 +12,7 @@ from typing import Protocol
 
 from chainshaper.values.errors import InputError
 from chainshaper.values.events import EventTables
-from chainshaper.values.handed_over import parse_through
+from chainshaper.values.handed_over import Through, parse_through
 from chainshaper.values.recording import INFO_FILE, Recording, RecordingInfo, open_recording
 
 
@@ -28,11 +28,15 @@ def open_source(
     Raises InputError: there is nothing that can be read, or ``through`` declares nothing.
     """
     declared = parse_through(through)
-    recording = _opened(paths, progress)
-    if not declared:
+    return with_declared(_opened(paths, progress), declared)
+
+
+def with_declared(recording: Recording, through: Through) -> Recording:
+    """Return a recording with what the user declares of it, beside what it says itself."""
+    known = tuple(dict.fromkeys((*recording.info.through, *through)))
+    if known == recording.info.through:
         return recording
-    known = dict.fromkeys((*recording.info.through, *declared))
-    return replace(recording, info=recording.info.model_copy(update={"through": tuple(known)}))
+    return replace(recording, info=recording.info.model_copy(update={"through": known}))
 
 
 def _opened(

@@ -15,7 +15,9 @@ Over a complete traversal the three add up to the latency, so their mean shares 
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import polars as pl
@@ -27,18 +29,22 @@ from chainshaper.analysis import (
     graph_of,
     recorded_flow,
 )
+from chainshaper.analysis.chains import chain_until
 from chainshaper.analysis.flow import DataFlow, left_when_taken
+from chainshaper.analysis.graph import with_possible_hand_overs
 from chainshaper.analysis.latency import summary
 from chainshaper.planning import ChainPlan, Plan
 from chainshaper.planning.chain_plan import publisher_servers
-from chainshaper.planning.plan import plan_of_chain
+from chainshaper.planning.plan import declared_in, plan_of_chain
 from chainshaper.planning.plan_file import plan_in
-from chainshaper.sources import open_source
+from chainshaper.sources import open_source, with_declared
 from chainshaper.values import events
+from chainshaper.values.application import Chain
 from chainshaper.values.durations import duration_text, milliseconds
 from chainshaper.values.errors import InputError, shown
 from chainshaper.values.notebook import notebook_html
 from chainshaper.values.recording import Recording
+from chainshaper.verify.ages import JudgedAge, judge_age
 from chainshaper.verify.overruns import (
     OverrunOutcome,
     dropped_in,
@@ -83,8 +89,10 @@ class Measurement:
     into_open_slots: int | None  # number of outputs that came when their slot had opened already
     dropped: dict[str, int] | None  # number of messages lost at a gate, by reason; None: no gate
     plan: ChainPlan | None  # in force
-    prediction: JudgedPrediction | None  # the plan's, beside this measurement
+    # The plan's, beside this measurement; of a chain through a loop, of its output before the loop.
+    prediction: JudgedPrediction | None
     left_out: LeftOut  # of the recording
+    age: JudgedAge | None = None  # of the data of the plan's loop; None: the plan has no loop
 
     def __repr__(self) -> str:
         about = f"{self.analysis.chain.spec}: {self.analysis.statistics.text}"
@@ -171,6 +179,14 @@ def measure_latency(
     return _measured(opened(recording), (chain,), plan, flow)[0]
 
 
+def _declaring(flow: DataFlow, plan: Plan | None) -> DataFlow:
+    """Add what is declared in a plan, as far as it can be in the recording."""
+    declared = () if plan is None else declared_in(plan)
+    missing = tuple(pair for pair in declared if pair not in flow.through)
+    possible, _ = with_possible_hand_overs(replace(flow, through=missing))
+    return replace(flow, through=(*flow.through, *possible.through))
+
+
 def opened(recording: Recording | str | Path) -> Recording:
     """The recording itself, or the one at a path."""
     return recording if isinstance(recording, Recording) else open_source(recording)
@@ -189,12 +205,15 @@ def _measured(
     chains: Sequence[str | None],
     plan: Plan | None,
     flow: DataFlow | None = None,
+    *,
+    declaring: Plan | None = None,
 ) -> list[Measurement]:
     """Measure several chains in a recording; its events are resolved once."""
     joint, info = _plan_of(recording, plan), recording.info
     due = [] if joint is None else [due for planned in joint.chains for due in due_of(planned)]
     spell, left_out = _in_force(recording)
-    flow = flow or recorded_flow(recording)
+    flow = _declaring(flow or recorded_flow(recording), joint or declaring)
+    recording = with_declared(recording, flow.through)
     if (
         gated := [planned for planned in joint.chains if any(publisher_servers(planned))]
         if joint
@@ -212,10 +231,23 @@ def _measured(
         analysis = replace(measured, notes=notes)
         output = analysis.chain.topics[-1]
         own_plan = None if joint is None else plan_of_chain(joint, output)
+        through_loop = None if joint is None else _through_loop(joint, analysis)
+        own_plan = through_loop or own_plan
         planned_for = own_plan is not None and own_plan.chain.output in (None, output)
         if own_plan is not None and planned_for:
             _refuse_other_period(own_plan, analysis, recording)
         decided = gate_releases(recording, own_plan, analysis)
+        # The plan is of the chain before its loop, the age of the data of the chain through it.
+        shaped, whole = analysis, None
+        if own_plan is not None and own_plan.loop is not None:
+            traversed = partial(
+                analyse_latency, flow, due=due, between=spell, pauses=info.pauses_ns
+            )
+            if through_loop is not None:
+                shaped, whole = traversed(_before_loop(analysis, own_plan)), analysis
+            elif own_plan.loop.chain is not None and planned_for:
+                with suppress(InputError):  # the loop was not seen in this recording
+                    whole = traversed(_in_front(own_plan.loop.chain, joint))
         measurements.append(
             Measurement(
                 recording=recording,
@@ -226,13 +258,38 @@ def _measured(
                 into_open_slots=into_open_slots(decided),
                 dropped=dropped_in(decided),
                 plan=own_plan,
-                prediction=judge_prediction(own_plan, analysis)
-                if own_plan and planned_for
+                prediction=judge_prediction(own_plan, shaped)
+                if own_plan and (planned_for or through_loop)
                 else None,
                 left_out=left_out,
+                age=_judged_age(own_plan, whole, recording),
             )
         )
     return measurements
+
+
+def _through_loop(plan: Plan, analysis: LatencyAnalysis) -> ChainPlan | None:
+    """Return the plan of the output that a chain has before the loop it goes through, if any."""
+    topics = analysis.chain.topics[:-1]
+    for planned in plan.chains:
+        if planned.loop is not None and planned.chain.output in topics:
+            return planned
+    return None
+
+
+def _before_loop(analysis: LatencyAnalysis, plan: ChainPlan) -> Chain:
+    """Return the part of a chain that its plan is for: up to the output that the loop reads."""
+    hops = analysis.chain.topics.index(plan.chain.output or "") + 1
+    return chain_until(analysis.graph, analysis.chain, hops)
+
+
+def _judged_age(
+    plan: ChainPlan | None, whole: LatencyAnalysis | None, recording: Recording
+) -> JudgedAge | None:
+    """Judge the age of the data of a plan's loop; None: there is no such loop."""
+    if plan is None or plan.loop is None or whole is None or whole.data_age is None:
+        return None
+    return judge_age(whole.chain.spec, plan.loop, whole.data_age, recording.events)
 
 
 def _refuse_other_period(plan: ChainPlan, analysis: LatencyAnalysis, recording: Recording) -> None:
@@ -322,9 +379,8 @@ def compare_chains(
     columns = []
     for number, recording in enumerate(opened_recordings, start=1):
         progress((number - 1) / len(opened_recordings), f"analysing {recording.path}")
-        columns.append(
-            _measured(recording, chains, plan if number == len(opened_recordings) else None)
-        )
+        in_force = plan if number == len(opened_recordings) else None
+        columns.append(_measured(recording, chains, in_force, declaring=joint))
     return tuple(
         Comparison(measurements[0].analysis.chain.spec, measurements)
         for measurements in zip(*columns, strict=True)

@@ -34,6 +34,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from chainshaper.analysis import recorded_flow
 from chainshaper.analysis.disturbance import stalled_after
+from chainshaper.analysis.graph import with_possible_hand_overs
 from chainshaper.analysis.latency import named_callbacks
 from chainshaper.sources import open_source
 from chainshaper.values.errors import InputError
@@ -81,6 +82,7 @@ class Sample:
     """Chain → its median undisturbed latency (ns), and the callbacks on the way."""
     shown: Mapping[Name, str] = field(default_factory=dict)
     """Text of each trigger, with the period that a timer's starts show."""
+    doubts: tuple[str, ...] = ()  # why what the user declared cannot be in it
 
 
 @dataclass(frozen=True)
@@ -132,16 +134,25 @@ def slowdowns_in(
     chains: Sequence[str] = (),
     progress: Callable[[float, str], None] = lambda *_: None,
     scheduler: str | None = None,
+    *,
+    through: Sequence[str] = (),
 ) -> tuple[list[Compared], list[str]]:
     """Read recordings and traces in parallel, and find slowdowns (:func:`find_slowdowns`).
 
-    ``chains`` are those whose latencies are compared; (): those that recordings name. Raises: as
+    ``chains`` are those whose latencies are compared; (): those that recordings name. ``through``
+    is what the user declares that no event shows (:mod:`~chainshaper.values.handed_over`). A
+    recording in which that cannot be is compared without it. Raises: as
     :func:`find_slowdowns` and :func:`~chainshaper.values.many_tasks.engine`. InputError: a
     recording cannot be read.
     """
     all_paths, purpose = [*paths, *before], "a comparison"
     samples = computed(
-        _read, all_paths, tuple(chains), scheduler=scheduler, purpose=purpose, progress=progress
+        _read,
+        all_paths,
+        (tuple(chains), tuple(through)),
+        scheduler=scheduler,
+        purpose=purpose,
+        progress=progress,
     )
     compared, notes = find_slowdowns(samples[: len(paths)], samples[len(paths) :])
     missing = {
@@ -150,19 +161,24 @@ def slowdowns_in(
         for sample in samples
         if chain not in sample.chains
     }
-    return compared, [*notes, *(f"{chain} is not in {name}" for chain, name in sorted(missing))]
+    notes += [f"{chain} is not in {name}" for chain, name in sorted(missing)]
+    notes += [f"{sample.recording}: {doubt}" for sample in samples for doubt in sample.doubts]
+    return compared, notes
 
 
 def _read(
-    path: Path, chains: Sequence[str], progress: Callable[[float, str], None] | None = None
+    path: Path,
+    asked: tuple[tuple[str, ...], tuple[str, ...]],
+    progress: Callable[[float, str], None] | None = None,
 ) -> Sample:
-    """Read the sample of a recording; one of many tasks."""
-    return sample_of(open_source(path, progress=progress), chains, str(path))
+    """Read the sample of a recording, by chains and declarations; one of many tasks."""
+    chains, through = asked
+    return sample_of(open_source(path, progress=progress, through=through), chains, str(path))
 
 
 def sample_of(recording: Recording, chains: Sequence[str] = (), name: str | None = None) -> Sample:
     """Collect the data of a recording to compare, with ``chains`` that it has ((): its own)."""
-    flow = recorded_flow(recording)
+    flow, doubts = with_possible_hand_overs(recorded_flow(recording))
     named = named_callbacks(flow).select("callback_id", "node", "starts", "shown")
     names = {number: (node, starts) for number, node, starts, _ in named.iter_rows()}
     shown = {(node, starts): text for _, node, starts, text in named.iter_rows()}
@@ -187,7 +203,7 @@ def sample_of(recording: Recording, chains: Sequence[str] = (), name: str | None
                 names[number] for number in analysis.chain.callbacks if number in names
             )
             measured_chains[analysis.chain.spec] = (float(median), on_the_way)
-    return Sample(name or str(recording.path), callbacks, measured_chains, shown)
+    return Sample(name or str(recording.path), callbacks, measured_chains, shown, doubts)
 
 
 def find_slowdowns(

@@ -1,10 +1,16 @@
 """What a run shows of itself: its state, with notes for a person."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from chainshaper.enforcement.undoing import LoopStep, RunState, ServerState, save_run_state
+from chainshaper.enforcement.undoing import (
+    LoopState,
+    LoopStep,
+    RunState,
+    ServerState,
+    save_run_state,
+)
 
 
 @dataclass
@@ -26,6 +32,10 @@ class RunReport:
     def show_steps(self, steps: Sequence[LoopStep]) -> None:
         """Show how loops were kept in step."""
         self.state = replace(self.state, steps=tuple(steps))
+
+    def show_loops(self, loops: Iterable[LoopState]) -> None:
+        """Show how loops that are kept in step are now."""
+        self.state = replace(self.state, loops=tuple(loops))
 
     def update_servers(self, update: Callable[[ServerState], ServerState]) -> None:
         """Change what is shown of each server."""

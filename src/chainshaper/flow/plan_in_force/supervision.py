@@ -76,6 +76,7 @@ class Supervision:
             self.end_messages()
             self.followers.show(self.report)
             self.loops.show(self.report, self.threads.latest)
+            self.report.show_loops(kept.state for kept in self.loops.running.values())
             self.look_at_servers(max(moved.values(), key=abs, default=None))
             if is_over := is_over or self.report.state.failure is not None:
                 self.report.state = replace(self.report.state, ended_ns=time.monotonic_ns())

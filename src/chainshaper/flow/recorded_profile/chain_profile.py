@@ -33,6 +33,7 @@ from chainshaper.planning import Profile
 from chainshaper.planning.request import DEFAULT_CORE
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.handed_over import through_texts
 from chainshaper.values.recording import Recording
 from chainshaper.verify.measure import longest_stall
 from chainshaper.verify.promises import NOT_PUBLISHED
@@ -109,6 +110,7 @@ def profile_of(
         asynchronous=writer.asynchronous,
         intra_process=writer.intra_process,
         output_depth=writer.output_depth,
+        through=through_texts(recording.info.through),
         simulated=simulated,
         interfering=interfering_callbacks(
             flow, analysis, executors.running, {*planned, *chain.callbacks}
