@@ -476,7 +476,9 @@ def report(
     in_force = opt.plan_in_force(plan)
     with out.late_progress("report") as progress:
         opened = [cs.open_source(path, through=through or ()) for path in recordings]
-        comparisons = cs.compare_chains(opened, chain, in_force, least=1, progress=progress)
+        comparisons = cs.compare_chains(
+            opened, chain, in_force, least=1, progress=progress, with_flow=True
+        )
         progress(0.9, "drawing")
         written = cs.write_report(comparisons, output, cycles or ()).absolute()
     if out.present(json, {"report": str(written), **comparisons_json(comparisons)}):

@@ -113,10 +113,10 @@ def report_page(
     shared, several = chains[0].measurements, len(chains) > 1
     names = distinct_names([measurement.recording.path for measurement in shared])
     # A recording is resolved once, however many chains it has.
-    recorded = {
-        id(measurement.recording): measurement.recording for measurement in all_measurements
-    }
-    flows = {key: recorded_flow(recording) for key, recording in recorded.items()}
+    flows: dict[int, DataFlow] = {}
+    for measurement in all_measurements:
+        if (key := id(measurement.recording)) not in flows:
+            flows[key] = measurement.flow or recorded_flow(measurement.recording)
     page, of_each, style, script = (
         (resources.files("chainshaper.reporting") / name).read_text("utf-8")
         for name in ("page.html", "chain.html", "page.css", "page.js")

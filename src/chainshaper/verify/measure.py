@@ -85,6 +85,7 @@ class Measurement:
     plan: ChainPlan | None  # in force
     prediction: JudgedPrediction | None  # the plan's, beside this measurement
     left_out: LeftOut  # of the recording
+    flow: DataFlow | None = None  # of the recording, where the caller wanted to keep it
 
     def __repr__(self) -> str:
         about = f"{self.analysis.chain.spec}: {self.analysis.statistics.text}"
@@ -189,12 +190,18 @@ def _measured(
     chains: Sequence[str | None],
     plan: Plan | None,
     flow: DataFlow | None = None,
+    *,
+    with_flow: bool = False,
 ) -> list[Measurement]:
-    """Measure several chains in a recording; its events are resolved once."""
+    """Measure several chains in a recording; its events are resolved once.
+
+    Keep what they were resolved to in the measurements if ``with_flow``, and all of it was measured.
+    """
     joint, info = _plan_of(recording, plan), recording.info
     due = [] if joint is None else [due for planned in joint.chains for due in due_of(planned)]
     spell, left_out = _in_force(recording)
     flow = flow or recorded_flow(recording)
+    kept = flow if with_flow and spell is None else None
     if (
         gated := [planned for planned in joint.chains if any(publisher_servers(planned))]
         if joint
@@ -230,6 +237,7 @@ def _measured(
                 if own_plan and planned_for
                 else None,
                 left_out=left_out,
+                flow=kept,
             )
         )
     return measurements
@@ -302,11 +310,13 @@ def compare_chains(
     *,
     least: int = 2,
     progress: Callable[[float, str], None] = lambda *_: None,
+    with_flow: bool = False,
 ) -> tuple[Comparison, ...]:
     """Measure every chain of an application in ``least`` recordings or more.
 
     If the plan in force in the last of them has several chains, these are measured; else the chain
-    that each recording names. ``chain`` selects one. Raises: as :func:`compare_recordings`.
+    that each recording names. ``chain`` selects one. ``with_flow`` keeps the recordings' data flows in
+    the measurements, for what needs them too. Raises: as :func:`compare_recordings`.
     """
     if len(recordings) < least:
         raise InputError("a comparison needs two recordings, such as `compare before after`")
@@ -322,9 +332,8 @@ def compare_chains(
     columns = []
     for number, recording in enumerate(opened_recordings, start=1):
         progress((number - 1) / len(opened_recordings), f"analysing {recording.path}")
-        columns.append(
-            _measured(recording, chains, plan if number == len(opened_recordings) else None)
-        )
+        in_force = plan if number == len(opened_recordings) else None
+        columns.append(_measured(recording, chains, in_force, with_flow=with_flow))
     return tuple(
         Comparison(measurements[0].analysis.chain.spec, measurements)
         for measurements in zip(*columns, strict=True)
