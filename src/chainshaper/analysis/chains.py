@@ -184,7 +184,9 @@ def _ambiguous(graph: ApplicationGraph, spec: str, chains: Sequence[Chain], comp
         remedy = f"  (only this one passes {only_here})"
         if only_here is None:
             remedy = f"  (write {'..'.join(points)})"
-            if [of_path.topics for of_path in shown].count(chain.topics) > 1 and points == chain.topics:
+            if [of_path.topics for of_path in shown].count(
+                chain.topics
+            ) > 1 and points == chain.topics:
                 remedy = _without_way_point(path, paths)
         way = " → ".join((graph.label(path[0]), *chain.topics))
         lines.append(f"  {way}{remedy}")

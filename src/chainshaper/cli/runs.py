@@ -231,7 +231,9 @@ def generate(
     nodes: int | None = opt.option(
         "--nodes N", "Instead of a package, describe a made-up application of so many nodes.", min=1
     ),
-    containers: int = opt.option("--containers N", "With --nodes: processes they share.", 20, min=1),
+    containers: int = opt.option(
+        "--containers N", "With --nodes: processes they share.", 20, min=1
+    ),
     chains: int = opt.option("--chains N", "With --nodes: chains through them.", 12, min=1),
     cores: int = opt.option("--cores N", "With --nodes: cores that they run on.", 8, min=1),
     seed: int = opt.option("--seed N", "With --nodes: random seed.", 1, min=0),

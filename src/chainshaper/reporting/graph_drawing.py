@@ -325,7 +325,7 @@ class _FoldBox:
         about = "\n".join((self.fold.name, *self.fold.nodes))
         return "\n".join(
             (
-                f'{_group(corner, "item fold-box")}<title>{escape(about)}</title>'
+                f"{_group(corner, 'item fold-box')}<title>{escape(about)}</title>"
                 f'<rect class="node fold" width="{width:.1f}" height="{height:.1f}" rx="5"'
                 f' style="fill: {colour_of(self.fold.name)}"/>',
                 f'<text class="title" x="{PAD}" y="18">{escape(self.fold.name)}</text>',

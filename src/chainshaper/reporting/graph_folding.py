@@ -97,7 +97,11 @@ def folds_of(graph: ApplicationGraph, most: int = MOST_BOXES) -> tuple[Fold, ...
     for callback in graph.callbacks:
         counted[callback.node] += 1
     return tuple(
-        Fold(name if len(nodes) > 1 else nodes[0], tuple(sorted(nodes)), sum(counted[node] for node in nodes))
+        Fold(
+            name if len(nodes) > 1 else nodes[0],
+            tuple(sorted(nodes)),
+            sum(counted[node] for node in nodes),
+        )
         for name, nodes in sorted(parts.items())
         if nodes
     )
@@ -113,9 +117,7 @@ def _below(namespace: str, nodes: Sequence[str]) -> dict[str, list[str]]:
     return parts
 
 
-def _by_process(
-    graph: ApplicationGraph, nodes: Sequence[str], room: int
-) -> dict[str, list[str]]:
+def _by_process(graph: ApplicationGraph, nodes: Sequence[str], room: int) -> dict[str, list[str]]:
     """Part nodes without a namespace by their process, if that makes at most so many boxes."""
     pids = {node.name: node.pid for node in graph.nodes}
     parts: dict[str, list[str]] = {}
@@ -146,7 +148,9 @@ def fold(
         for part in folds
         if (nodes := tuple(node for node in part.nodes if node not in alone))
     )
-    box_of: dict[str, int | str] = {node: number for number, f in enumerate(left) for node in f.nodes}
+    box_of: dict[str, int | str] = {
+        node: number for number, f in enumerate(left) for node in f.nodes
+    }
     box_of |= {node: node for node in alone}
     pills = {*(() if chain is None else chain.topics)}
     common, bundles = [], defaultdict[tuple[int | str, int | str], list[str]](list)
@@ -177,10 +181,7 @@ def fold(
 def _is_in(part: Fold, namespaces: Collection[str]) -> bool:
     """Return whether a fold is one of these namespaces, or below one."""
     name = part.name.removesuffix("/…")
-    return any(
-        name == wanted or name.startswith(wanted.rstrip("/") + "/")
-        for wanted in namespaces
-    )
+    return any(name == wanted or name.startswith(wanted.rstrip("/") + "/") for wanted in namespaces)
 
 
 def _ends_at_folds(

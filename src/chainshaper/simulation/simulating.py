@@ -218,7 +218,8 @@ def _create_objects(system: System) -> tuple[list[live.ProcessLog], Handles]:
     logs = []
     for process in system.processes:
         first = first_of.get(process.pid)
-        logs.append(EventLog(clock=lambda: 0, new_handle=first and first.new_handle))
+        new_handle = None if first is None else first.new_handle
+        logs.append(EventLog(clock=lambda: 0, new_handle=new_handle))
         first_of.setdefault(process.pid, logs[-1])
     for process, log in zip(system.processes, logs, strict=True):
         log.node(process.node, "simulation")

@@ -195,7 +195,7 @@ def _measured(
 ) -> list[Measurement]:
     """Measure several chains in a recording; its events are resolved once.
 
-    Keep what they were resolved to in the measurements if ``with_flow``, and all of it was measured.
+    Keep what they were resolved to in the measurements if ``with_flow``, and all was measured.
     """
     joint, info = _plan_of(recording, plan), recording.info
     due = [] if joint is None else [due for planned in joint.chains for due in due_of(planned)]
@@ -315,8 +315,8 @@ def compare_chains(
     """Measure every chain of an application in ``least`` recordings or more.
 
     If the plan in force in the last of them has several chains, these are measured; else the chain
-    that each recording names. ``chain`` selects one. ``with_flow`` keeps the recordings' data flows in
-    the measurements, for what needs them too. Raises: as :func:`compare_recordings`.
+    that each recording names. ``chain`` selects one. ``with_flow`` keeps the recordings' data flows
+    in the measurements, for what needs them too. Raises: as :func:`compare_recordings`.
     """
     if len(recordings) < least:
         raise InputError("a comparison needs two recordings, such as `compare before after`")
