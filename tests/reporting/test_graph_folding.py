@@ -64,7 +64,7 @@ def test_the_largest_namespace_is_parted_while_there_is_room() -> None:
     names = {most: [part.name for part in folds_of(graph, most)] for most in (1, 4, 5)}
     whole = ["/control/follower", "/monitor", "/planning", "/sensing/…"]
     assert names[4] == whole  # /planning has no namespace below it, so it is all of it
-    # Of one node, a fold has the name; /sensing has a node itself, and two in /sensing/lidar.
+    # A fold of one node has its name; /sensing has a node itself, and two in /sensing/lidar.
     parted = ["/control/follower", "/monitor", "/planning", "/sensing/gnss", "/sensing/lidar"]
     assert names[5] == parted
     assert names[1] == whole  # there are no larger boxes than first parts of names
@@ -134,18 +134,20 @@ def test_an_unfolded_namespace_has_its_topics() -> None:
 
 def test_a_topic_that_joins_most_boxes_is_only_named() -> None:
     wired: dict[str, tuple[str | None, tuple[str, ...]]] = {"/tree/source": (None, ("/tf",))}
-    wired |= {f"/part{number}/reader": ("/tf", ("/odd",)) for number in range(8)}
+    wired |= {f"/part{number}/reader": ("/tf", ("/unread",)) for number in range(8)}
     folded = fold(described(graph_with(wired)))
     assert folded.common == ("/tf",)
     assert not folded.bundles
-    without = {name: wired[name] for name in list(wired)[:-2]}  # six of seven boxes are few
+    without = {name: wired[name] for name in list(wired)[:-2]}  # seven boxes are few
     assert not fold(described(graph_with(without))).common
 
 
 def large() -> ApplicationDescription:
     """An application of one node more than a picture shows."""
     wired = {**WIRED}
-    wired |= {f"/tools/tool{number}": ("/pose", ()) for number in range(MOST_NODES + 1 - len(WIRED))}
+    wired |= {
+        f"/tools/tool{number}": ("/pose", ()) for number in range(MOST_NODES + 1 - len(WIRED))
+    }
     return described(graph_with(wired))
 
 
@@ -171,6 +173,6 @@ def test_pictures_of_large_applications_are_folded(tmp_path: Path) -> None:
 
 
 def test_an_unknown_namespace_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--unfold /sensin: no node .* write /sensing"):
+    with pytest.raises(InputError, match=r"--unfold /sensin: no node .* write /sensing"):
         write_picture(large(), tmp_path / "graph.svg", unfolded=["/sensin"])
     assert not [*tmp_path.iterdir()]

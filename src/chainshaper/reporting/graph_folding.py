@@ -73,9 +73,9 @@ def folds_of(graph: ApplicationGraph, most: int = MOST_BOXES) -> tuple[Fold, ...
 
     The largest namespace is parted into those below it, again and again, while there is room.
     """
-    names = list(dict.fromkeys(node.name for node in graph.nodes))
-    names += [c.node for c in graph.callbacks if c.node not in {*names}]
-    names = list(dict.fromkeys(names))
+    names = list(
+        dict.fromkeys([*(n.name for n in graph.nodes), *(c.node for c in graph.callbacks)])
+    )
     parts: dict[str, list[str]] = {"/": [name for name in names if namespace_of(name) == "/"]}
     for name in names:
         if namespace_of(name) != "/":
@@ -96,15 +96,16 @@ def folds_of(graph: ApplicationGraph, most: int = MOST_BOXES) -> tuple[Fold, ...
     counted = defaultdict[str, int](int)
     for callback in graph.callbacks:
         counted[callback.node] += 1
-    return tuple(
+    folds = (
         Fold(
-            name if len(nodes) > 1 else nodes[0],
-            tuple(sorted(nodes)),
-            sum(counted[node] for node in nodes),
+            name=name if len(nodes) > 1 else nodes[0],
+            nodes=tuple(sorted(nodes)),
+            callbacks=sum(counted[node] for node in nodes),
         )
-        for name, nodes in sorted(parts.items())
+        for name, nodes in parts.items()
         if nodes
     )
+    return tuple(sorted(folds, key=lambda part: part.name))
 
 
 def _below(namespace: str, nodes: Sequence[str]) -> dict[str, list[str]]:
@@ -158,11 +159,11 @@ def fold(
         sources = {box_of[node] for node in graph.publishers.get(topic, ()) if node in box_of}
         targets = {box_of[node] for node in graph.subscribers.get(topic, ()) if node in box_of}
         inside = sum(box in open_nodes for box in sources | targets)
-        if topic in pills:
+        if topic in pills or not (sources and targets):
             continue
         if len(sources | targets) >= max(FEWEST_COMMON, COMMON * len({*box_of.values()})):
             common.append(topic)
-        elif inside > 1 and sources and targets:
+        elif inside > 1:
             pills.add(topic)
         else:
             for source in sources:
