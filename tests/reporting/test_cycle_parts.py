@@ -120,8 +120,7 @@ def test_of_a_large_application_the_nodes_of_the_chain_alone_are_drawn_one_by_on
     svg = timed_graph_svg(flow, graph_of(flow), analysis.chain)
     assert ">/first</text>" in svg
     assert ">/beside0</text>" not in svg
-    assert ">50 nodes, 0 callbacks</text>" not in svg  # /second is in that box as well
-    assert ">51 nodes, 1 callbacks</text>" in svg
+    assert ">51 nodes, 1 callback</text>" in svg  # /second is in that box as well
 
 
 def test_pictures_of_a_chain_are_written_and_nothing_is_overwritten(tmp_path: Path) -> None:

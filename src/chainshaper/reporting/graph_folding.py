@@ -10,7 +10,7 @@ boxes (/tf, /diagnostics) would hide all others: they are named below the pictur
 
 import colorsys
 import zlib
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -34,8 +34,8 @@ class Fold:
     @property
     def text(self) -> str:
         """Text: how much is in it."""
-        plural = "" if len(self.nodes) == 1 else "s"
-        return f"{len(self.nodes)} node{plural}, {self.callbacks} callbacks"
+        counted = ((len(self.nodes), "node"), (self.callbacks, "callback"))
+        return ", ".join(f"{number} {word}{'s' if number != 1 else ''}" for number, word in counted)
 
 
 @dataclass(frozen=True)
@@ -93,9 +93,7 @@ def folds_of(graph: ApplicationGraph, most: int = MOST_BOXES) -> tuple[Fold, ...
         else:
             settled.add(opened)
     parts |= _by_process(graph, parts.pop("/"), most - len(parts))
-    counted = defaultdict[str, int](int)
-    for callback in graph.callbacks:
-        counted[callback.node] += 1
+    counted = Counter(callback.node for callback in graph.callbacks)
     folds = (
         Fold(
             name=name if len(nodes) > 1 else nodes[0],
@@ -144,8 +142,9 @@ def fold(
     on_chain = {c.node for c in graph.callbacks if c.id in {*of_chain}}
     open_nodes = {node for part in folds if _is_in(part, unfolded) for node in part.nodes}
     alone = on_chain | open_nodes
+    counted = Counter(callback.node for callback in graph.callbacks)
     left = tuple(
-        replace(part, nodes=nodes)
+        replace(part, nodes=nodes, callbacks=sum(counted[node] for node in nodes))
         for part in folds
         if (nodes := tuple(node for node in part.nodes if node not in alone))
     )
