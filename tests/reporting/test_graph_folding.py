@@ -3,6 +3,7 @@
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import polars as pl
 import pytest
@@ -30,9 +31,11 @@ def graph_with(
     wired: dict[str, tuple[str | None, tuple[str, ...]]], pids: dict[str, int] | None = None
 ) -> ApplicationGraph:
     """Make a graph of nodes with a callback each."""
-    callbacks, publishers, subscribers = [], dict[str, tuple[str, ...]](), {}
+    callbacks: list[Callback] = []
+    publishers: dict[str, tuple[str, ...]] = {}
+    subscribers: dict[str, tuple[str, ...]] = {}
     for number, (node, (read, written)) in enumerate(wired.items()):
-        kind = "timer" if read is None else "subscription"
+        kind: Literal["timer", "subscription"] = "timer" if read is None else "subscription"
         period = 100_000_000 if read is None else None
         callbacks.append(
             Callback(
