@@ -335,3 +335,18 @@ def test_two_callbacks_on_one_topic_do_not_synchronise_it_with_itself() -> None:
     chain = find_chain(graph, "/big../out")
     assert chain.topics == ("/big", "/out")
     assert graph.path(chain)[1].publishes == ("/out",)
+
+
+def test_a_path_of_which_every_topic_is_written_is_meant() -> None:
+    """`/a` leads to `/c` at once, and by `/b`, and by `/b` and `/d`."""
+    detours = graph(
+        first=[(None, ("/a",))],
+        second=[("/a", ("/b", "/c"))],
+        third=[("/b", ("/c", "/d"))],
+        fourth=[("/d", ("/c",))],
+    )
+    assert find_chain(detours, "/a../c").topics == ("/a", "/c")
+    assert find_chain(detours, "/a../b../c").topics == ("/a", "/b", "/c")
+    assert find_chain(detours, "/a../d../c").topics == ("/a", "/b", "/d", "/c")
+    for chain in enumerate_chains(detours, "/a", "/c").chains:
+        assert find_chain(detours, chain.spec).topics == chain.topics

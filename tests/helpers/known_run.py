@@ -7,6 +7,7 @@ is 30.02 ms, and the actuator starts 1 ms after that. Core 1 stalls for 2 ms in 
 /second computes, which the margin of 3 ms absorbs.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,12 +50,13 @@ def known_run(
     first: str = "/first",
     untaken: tuple[int, ...] = (),
     overran: tuple[int, ...] = (),
+    beside: Sequence[str] = (),
     **facts: Any,
 ) -> Recording:
     """The recording; messages on /t1 of the cycles ``untaken`` are not taken.
 
     Outputs of ``overran`` arrive at the shaping node 1 ms behind the slot, and leave at once.
-    ``facts`` are further fields of `recording.json`.
+    Nodes ``beside`` the chain do nothing. ``facts`` are further fields of `recording.json`.
     """
     plan = known_plan()
     assert plan.shaping_node is not None
@@ -62,6 +64,8 @@ def known_run(
     gate = f"/{plan.shaping_node.name}"
     nodes = [story.node(name, pid) for pid, name in ((1, first), (2, "/second"), (3, gate))]
     actuator = story.subscription(story.node("/actuator", 4), "/t2")
+    for number, name in enumerate(beside):
+        story.node(name, 100 + number)
     timer = story.timer(nodes[0], period=PERIOD_NS, symbol="First<1>::tick()")
     second = story.subscription(nodes[1], "/t1")
     shaping = story.subscription(nodes[2], plan.shaping_node.input)

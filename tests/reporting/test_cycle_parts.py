@@ -107,7 +107,7 @@ def test_the_graph_has_times_beside_arrows_and_callbacks(tmp_path: Path) -> None
     assert png_of(svg).startswith(b"\x89PNG")
 
 
-def test_of_a_large_application_the_nodes_of_the_chain_alone_are_drawn() -> None:
+def test_of_a_large_application_the_nodes_of_the_chain_alone_are_drawn_one_by_one() -> None:
     story = Story()
     timer, out = story.source("/first", 1, "/a")
     reader, _ = story.relay("/second", 2, "/a", "/b")
@@ -119,7 +119,8 @@ def test_of_a_large_application_the_nodes_of_the_chain_alone_are_drawn() -> None
     analysis = analyse_latency(story.tables(), "/a")
     svg = timed_graph_svg(flow, graph_of(flow), analysis.chain)
     assert ">/first</text>" in svg
-    assert "/beside" not in svg
+    assert ">/beside0</text>" not in svg
+    assert ">51 nodes, 1 callback</text>" in svg  # /second is in that box as well
 
 
 def test_pictures_of_a_chain_are_written_and_nothing_is_overwritten(tmp_path: Path) -> None:

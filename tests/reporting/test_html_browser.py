@@ -270,3 +270,30 @@ def test_the_graphs_of_a_report_leave_its_own_texts_alone(page: Page) -> None:
     assert page.run("document.getElementById('tip').tagName") == "DIV"
     family = "getComputedStyle(document.querySelector('#over-time svg text')).fontFamily"
     assert "system-ui" in page.run(family)
+
+
+def test_a_node_is_searched_in_the_folded_graph(
+    page: Page, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Of 46 nodes 45 are folded; a search opens their namespace, and what matches stands out."""
+    folder = tmp_path_factory.mktemp("folded")
+    nodes = [f"/tools/tool{number}" for number in range(42)]
+    run = known_run(folder / "run", 3, beside=nodes)
+    large = write_report([measure_latency(run)], folder / "report.html")
+    with opened(large, folder / "profile") as folded:
+        folded.wait_for("document.documentElement.dataset.drawn === 'yes'")
+        ask = "document.querySelectorAll('.folded {}').length".format
+        assert folded.run(ask("details.fold")) == 2  # /tools, and the nodes without a namespace
+        assert folded.run(ask("details.fold[open]")) == 0
+        search = (
+            "{{ const field = document.querySelector('.folded input'); field.value = '{}';"
+            " field.dispatchEvent(new Event('input')); }}"
+        ).format
+        folded.run(search("TOOL17"))
+        assert folded.run(ask("details.fold[open]")) == 1
+        assert folded.run("document.querySelector('.folded output').value") == "1 nodes and topics"
+        assert folded.run(ask(".match")) == 2  # in the picture of all it is within a box
+        assert folded.run(ask(".dim")) > 40
+        folded.run(search(""))
+        assert folded.run(ask("details.fold[open], .match, .dim")) == 0
+        assert folded.complaints == []

@@ -84,7 +84,8 @@ def find_chain(graph: ApplicationGraph, spec: str) -> Chain:
     """Find the one chain of ``graph`` that ``spec`` means.
 
     A path through a shaping node's standby is left out where there is the path through the shaping
-    node: traversals go on through the standby where that published.
+    node: traversals go on through the standby where that published. If ``spec`` names every topic
+    of a path, that path is meant, although others make detours between these topics.
 
     Raises InputError: a topic or node that does not exist, no path, or only a cyclic one.
     SeveralPathsError: several.
@@ -96,6 +97,10 @@ def find_chain(graph: ApplicationGraph, spec: str) -> Chain:
         raise search.no_path()
     standbys = {callback.id for callback in graph.callbacks if callback.node.endswith(STANDBY)}
     chains = [chain for chain in chains if standbys.isdisjoint(chain.callbacks)] or chains
+    written = {name for name, _ in search.stages}
+    exact = [chain for chain in chains if written.issuperset(chain.topics)]
+    if len(exact) == 1:  # and it is among the shortest paths, which are listed first
+        return exact[0]
     if len(chains) > 1 or not complete:
         raise SeveralPathsError(_ambiguous(graph, spec, chains, complete))
     return chains[0]
@@ -179,7 +184,9 @@ def _ambiguous(graph: ApplicationGraph, spec: str, chains: Sequence[Chain], comp
         remedy = f"  (only this one passes {only_here})"
         if only_here is None:
             remedy = f"  (write {'..'.join(points)})"
-            if points == chain.topics:
+            if [of_path.topics for of_path in shown].count(
+                chain.topics
+            ) > 1 and points == chain.topics:
                 remedy = _without_way_point(path, paths)
         way = " → ".join((graph.label(path[0]), *chain.topics))
         lines.append(f"  {way}{remedy}")

@@ -104,16 +104,21 @@ def _waited_in_vain(
     Late means: the declared period was over since the start before.
     """
     nodes = callbacks.unique("callback_id").select("callback_id", "node")
-    rows = instances.join(nodes, on="callback_id", how="left", maintain_order="left")
+    of_timer = pl.col("callback_id") == timer
+    beside = instances.filter(of_timer)["tid"].unique().implode()
+    node = nodes.filter(of_timer).select(pl.col("node").cast(pl.String)).item()
+    of_node = nodes.filter(pl.col("node").cast(pl.String).eq_missing(pl.lit(node, pl.String)))
+    rows = instances.filter(
+        pl.col("tid").is_in(beside) | pl.col("callback_id").is_in(of_node["callback_id"].implode())
+    ).join(nodes, on="callback_id", how="left", maintain_order="left")
     rows = rows.with_columns(over=pl.coalesce("end", "start"))
     rows = rows.with_columns(
         pl.col("over").shift(1).over("pid", key).alias(f"over_{key}") for key in ("tid", "node")
     )
-    of_timer = rows.filter(pl.col("callback_id") == timer)
     due = pl.col("start").shift(1) + declared
     free = pl.max_horizontal(due, "over_tid", "over_node")
     waited = (pl.col("start") - free > _IDLE * usual).filter(due.is_not_null())
-    return float(of_timer.select(waited.mean()).item() or 0.0) >= MOSTLY
+    return float(rows.filter(of_timer).select(waited.mean()).item() or 0.0) >= MOSTLY
 
 
 def roundest_period(apart: npt.NDArray[np.int64], usual: float) -> int:

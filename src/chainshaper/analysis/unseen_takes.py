@@ -18,6 +18,7 @@ from chainshaper.values.application import INTERNAL_TOPICS
 
 _FEWEST = 3  # how many linked callbacks show that publications and callbacks alternate
 _MOSTLY = 0.5  # share of the publications, from the first to the last linked, that must be linked
+_THREAD = ["pid", "tid"]
 _WHILE = 0.1  # share of the usual distance of starts: a pause is longer than an executor's work
 
 
@@ -54,14 +55,20 @@ def with_unseen_takes(
         return taken, ()
     ran_bare = instances.filter(~pl.col("intra_process") & ~pl.col("assumed"))
     ran_bare = ran_bare.join(bare.select("callback_id", "node", "topic"), on="callback_id")
-    unseen, parts = [], [taken]
+    # Hundreds of subscriptions, of as many topics and threads: the frames are parted once.
+    topics = bare["topic"].cast(pl.String).unique().implode()
+    written_on = _parted(published.filter(pl.col("topic").cast(pl.String).is_in(topics)), "topic")
+    over = pl.coalesce("end", "until").alias("over")
+    busy_in = _parted(instances.select(*_THREAD, over, began="start"), *_THREAD)
+    unseen, parts = [], []
     for (number,), ran in ran_bare.sort("start").group_by("callback_id", maintain_order=True):
         node, topic, tid, first = ran.select("node", "topic", "tid", "start").row(0)
-        written = published.filter(pl.col("topic") == topic)
+        written = written_on.get((topic,), published.clear())
         publishers, linked = written["publisher"].n_unique(), ran.clear()
         if publishers == 1:
-            linked = _linked(ran, written, instances)
-            parts.append(_as_takes(linked, ran, taken))
+            threads = ran.select(_THREAD).unique(maintain_order=True).iter_rows()
+            linked = _linked(ran, written, pl.concat([busy_in[thread] for thread in threads]))
+            parts.append(linked)
         unseen.append(
             UnseenTakes(
                 callback_id=int(str(number)),
@@ -74,15 +81,24 @@ def with_unseen_takes(
                 publishers=publishers,
             )
         )
-    if len(parts) > 1:
-        taken = pl.concat(parts).sort("time", "pid", "tid", maintain_order=True)
+    if parts:
+        taken = pl.concat([taken, _as_takes(pl.concat(parts), ran_bare, taken)])
+        taken = taken.sort("time", "pid", "tid", maintain_order=True)
         taken = taken.drop("take").with_row_index("take")
     return taken, tuple(unseen)
 
 
-def _linked(ran: pl.DataFrame, written: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
-    """Select the rows of ``ran`` whose message is certain, and add its ``publication``."""
-    sent, thread = written["time"].to_numpy(), ["pid", "tid"]
+def _parted(frame: pl.DataFrame, *by: str) -> dict[tuple[object, ...], pl.DataFrame]:
+    """Part a frame by the values of some columns, which the parts have as well."""
+    return frame.partition_by(*by, maintain_order=True, as_dict=True)
+
+
+def _linked(ran: pl.DataFrame, written: pl.DataFrame, busy: pl.DataFrame) -> pl.DataFrame:
+    """Select the rows of ``ran`` whose message is certain, and add its ``publication``.
+
+    ``busy`` has when each instance on the threads of ``ran`` ``began`` and was ``over``.
+    """
+    sent, thread = written["time"].to_numpy(), _THREAD
     place = np.searchsorted(sent, ran["start"].to_numpy(), side="right") - 1
     counts = np.bincount(place[place >= 0], minlength=len(sent))
     started = ran.select(*thread, "start", "instance", place=pl.Series(place, dtype=pl.Int64))
@@ -93,8 +109,6 @@ def _linked(ran: pl.DataFrame, written: pl.DataFrame, instances: pl.DataFrame) -
         .cast({"place": pl.Int64})
     )
     rows = rows.join(started.unique("place", keep="first"), on="place", how="left")
-    over = pl.coalesce("end", "until").alias("over")
-    busy = instances.select(*thread, over, began="start")
     rows = latest_before(rows, busy, thread, "time", "began")
     free = (pl.col("over") <= pl.col("time")) | pl.col("began").is_null()
     # The thread that reads may publish as well. So the pause may lie before any of its instances

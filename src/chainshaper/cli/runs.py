@@ -221,22 +221,62 @@ def simulate(
 
 
 def generate(
-    application: Path = opt.APPLICATION,
+    application: Path | None = opt.argument("[APP.yaml]", "The application's description."),
     output: Path = opt.option(
-        "--output -o DIR", "Folder of the package, named like it; must not exist.", ...
+        "--output -o PATH",
+        "Folder of the package, named like it, or with --nodes the description's file; must not"
+        " exist.",
+        ...,
     ),
+    nodes: int | None = opt.option(
+        "--nodes N", "Instead of a package, describe a made-up application of so many nodes.", min=1
+    ),
+    containers: int = opt.option(
+        "--containers N", "With --nodes: processes they share.", 20, min=1
+    ),
+    chains: int = opt.option("--chains N", "With --nodes: chains through them.", 12, min=1),
+    cores: int = opt.option("--cores N", "With --nodes: cores that they run on.", 8, min=1),
+    seed: int = opt.option("--seed N", "With --nodes: random seed.", 1, min=0),
     json: bool = opt.option("--json", "Print what was written as JSON.", False),
 ) -> None:
     """Write a colcon package with the application as ROS 2 nodes in C++.
 
     Build it with `colcon build`, then `ros2 launch NAME NAME.launch.py`; `chainshaper shape` shapes
-    that as any other application.
+    that as any other application. With --nodes, write the description of a large application
+    instead, to try things on.
     """
+    if nodes is not None:
+        if application is not None:
+            raise InputError("give either APP.yaml, to write its package, or --nodes")
+        _describe_large(output, nodes, containers, chains, cores, seed, json=json)
+        return
+    if application is None:
+        raise InputError("what to generate is missing: name APP.yaml, or say --nodes N")
     files = cs.generate_package(cs.load_application(application), output)
     value = {"package": output.name, "folder": str(output), "files": list(map(str, files))}
     if out.present(json, value):
         out.show_line(output)
         out.next_step("colcon", "build", "--base-paths", output)
+
+
+def _describe_large(
+    output: Path, nodes: int, containers: int, chains: int, cores: int, seed: int, *, json: bool
+) -> None:
+    """Write the description of a large application, and show its chains."""
+    import yaml
+
+    from chainshaper.values.files import new_file, write_whole
+    from chainshaper.workload.description import application_as_written
+    from chainshaper.workload.large_application import large_application
+
+    new_file(output, opt.DESCRIPTIONS)
+    made = large_application(nodes, containers, chains, cores, seed)
+    text = yaml.safe_dump(application_as_written(made.application), sort_keys=False)
+    write_whole(output, [text.encode()])
+    if out.present(json, {"description": str(output), "chains": list(made.chains)}):
+        for line in (str(output), *made.chains):
+            out.show_line(line)
+        out.next_step("chainshaper", "simulate", output, "-o", "simulated")
 
 
 def record(

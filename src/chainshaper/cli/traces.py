@@ -60,7 +60,15 @@ def describe(
 def graph(
     trace: list[Path] = opt.TRACE,
     output: Path | None = opt.option(
-        "--output -o FILE", "File to write: .svg, .dot or .json; must not exist."
+        "--output -o FILE", "File to write: .svg, .png, .dot or .json; must not exist."
+    ),
+    chain: str | None = opt.option(
+        "--chain FIRST..LAST", "With --output: make this chain stand out in a picture."
+    ),
+    unfold: list[str] | None = opt.option(
+        "--unfold NAMESPACE",
+        "With --output: show the nodes of this namespace. A picture of more than 40 nodes is folded"
+        " by namespace; / shows all nodes (may be repeated).",
     ),
     everything: bool = opt.option(
         "--all",
@@ -77,11 +85,15 @@ def graph(
 
     if output is not None:
         new_file(output, graph_drawing.ENDINGS)
+    elif chain or unfold:
+        raise InputError("--chain and --unfold are for a picture: add --output graph.svg")
     with out.opened("graph", trace, through) as (recording, report):
         application = cs.describe_application(recording)
         if output is not None:
             report(0.9, "drawing")
-            cs.write_picture(application, output, everything=everything)
+            cs.write_picture(
+                application, output, everything=everything, chain=chain, unfolded=unfold or ()
+            )
     if json:
         out.print_json(graph_drawing.application_json(application))
     elif output is None:
@@ -484,7 +496,9 @@ def report(
     in_force = opt.plan_in_force(plan)
     with out.late_progress("report") as progress:
         opened = [cs.open_source(path, through=through or ()) for path in recordings]
-        comparisons = cs.compare_chains(opened, chain, in_force, least=1, progress=progress)
+        comparisons = cs.compare_chains(
+            opened, chain, in_force, least=1, progress=progress, with_flow=True
+        )
         progress(0.9, "drawing")
         written = cs.write_report(comparisons, output, cycles or ()).absolute()
     if out.present(json, {"report": str(written), **comparisons_json(comparisons)}):

@@ -23,6 +23,7 @@ are placed by what was measured, as far as it lies between the two.
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -214,11 +215,13 @@ class Profile:
         """The node of the last callback, which publishes the output."""
         return self.nodes[-1] if self.nodes else None
 
-    @property
+    @cached_property
     def every(self) -> NDArray[np.int64]:
-        """The latencies of all cycles."""
+        """The latencies of all cycles. Nobody writes into it: it is checked once."""
         every = self.every_latency_ns
-        return check_latencies(self.latencies_ns if every is None else every)
+        checked = check_latencies(self.latencies_ns if every is None else every)
+        checked.flags.writeable = False
+        return checked
 
     @property
     def longest_ns(self) -> int:

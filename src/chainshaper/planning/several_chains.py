@@ -116,12 +116,18 @@ def _on_wished_cores(
 ) -> tuple[Plan, list[str]]:
     """Return the plan on the wished cores.
 
-    Where chains collide although one of the cores is idle, one chain moves there: return the first
-    such plan without collisions.
+    Where chains collide on as few of them as are enough by the lengths of their slots, they stay on
+    the cores of the recording, if these are among the wished ones; or, where one of the cores is
+    idle, one chain moves there: return the first such plan without collisions.
     """
     moved, doubts = on_cores(profiles, request)
     candidates = [(moved, doubts)]
     if request.policy != "pipelined":
+        recorded: dict[str, int] = {}
+        for profile in profiles:
+            recorded |= profile.core_of
+        if request.cores and len(profiles) > 1 and {*recorded.values()} <= {*request.cores}:
+            candidates.append(moved_to(profiles, request.cores, recorded))
         used = {core for profile in moved for core in profile.core_of.values()}
         idle = next((core for core in request.cores or () if core not in used), None)
         if idle is not None:

@@ -28,10 +28,18 @@ import numpy as np
 import polars as pl
 
 from chainshaper.analysis import DataFlow, callback_statistics
-from chainshaper.analysis.chains import depth_first_order
+from chainshaper.analysis.chains import depth_first_order, find_chain
 from chainshaper.analysis.edge_times import edge_times
 from chainshaper.analysis.graph import ApplicationDescription
 from chainshaper.planning.offsets import linked
+from chainshaper.reporting.graph_folding import (
+    Fold,
+    FoldedGraph,
+    colour_of,
+    fold,
+    folds_of,
+    namespace_of,
+)
 from chainshaper.reporting.tables import Column, ResultTable, listed, ms, words
 from chainshaper.values.application import (
     INTERNAL_SERVICES,
@@ -41,7 +49,8 @@ from chainshaper.values.application import (
     Chain,
     period_text,
 )
-from chainshaper.values.errors import escape, shown
+from chainshaper.values.close_names import close_names
+from chainshaper.values.errors import InputError, escape, shown
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.recording import lost_text
 
@@ -61,10 +70,11 @@ SWEEPS = 16  # how often columns are swept, to sort them and to choose heights
 MARGIN = 24.0
 CHARACTER = 7.3  # width of a character of 12 px
 SMALL = 6.3  # width of a character of 10 px
-MOST_NODES = 40  # of a picture with times; of more, the chain's alone are drawn
+MOST_NODES = 40  # of a picture; more are folded by their namespaces
 TITLE, ROW, PILL, PAD = 28.0, 36.0, 26.0, 10.0
 TURN = 45.0  # how far an arrow goes on before it turns around
 LONGEST = 46  # characters of a function's name
+LISTED_TOPICS = 20  # that pointing at an arrow of many topics names
 COLOURS = {
     "timer": "#c2571a",
     "subscription": "#1f6fb2",
@@ -84,7 +94,9 @@ _DEFINED = """\
 .graph .line { stroke: #d5d9df; } .graph .topic { fill: #fff6d6; stroke: #b8962e; }
 .graph .arrow { fill: none; stroke: #555; stroke-width: 1.3; marker-end: url(#graph-tip); }
 .graph .passes { stroke-dasharray: 5 4; } .graph .back { stroke: #b03a3a; }
-.graph .chain { stroke-width: 3; }
+.graph .chain { stroke-width: 3; } .graph .bundle { stroke: #9aa4b1; stroke-width: 1; }
+.graph .bundle.back { stroke: #cf9a9a; } .graph .bundle:hover { stroke: #1a1a1a; stroke-width: 3; }
+.graph .fold { stroke-dasharray: 6 3; }
 .graph .time { font-size: 10px; fill: #8a3d00; stroke: #fff; stroke-width: 3;
   paint-order: stroke; }
 </style></defs>"""
@@ -247,10 +259,13 @@ class _NodeBox:
     def svg(self, corner: Point) -> str:
         width, height = self.box
         parts = [
-            _group(corner),
+            _group(corner, "item"),
             f'<rect class="node" width="{width:.1f}" height="{height:.1f}" rx="5"/>',
             f'<rect class="head" x="1" y="1" width="{width - 2:.1f}" height="{TITLE - 2:.1f}"'
-            ' rx="4"/>',
+            f' rx="4" style="fill: {colour_of(namespace_of(self.name))}"/>'
+            if namespace_of(self.name) != "/"
+            else f'<rect class="head" x="1" y="1" width="{width - 2:.1f}"'
+            f' height="{TITLE - 2:.1f}" rx="4"/>',
             f'<text class="title" x="{PAD}" y="18">{escape(self.name)}</text>',
             f'<text class="small" x="{width - PAD:.1f}" y="18" text-anchor="end">'
             f"{self.processes}</text>",
@@ -293,17 +308,72 @@ def _nodes(application: ApplicationDescription, times: GraphTimes = NO_TIMES) ->
     ]
 
 
+@dataclass(frozen=True)
+class _FoldBox:
+    """A folded namespace in the picture."""
+
+    number: int
+    fold: Fold
+
+    @property
+    def box(self) -> "Box":
+        widths = CHARACTER * (len(self.fold.name) + 1), SMALL * len(self.fold.text)
+        return Box(max(widths) + 2 * PAD, TITLE + ROW / 2)
+
+    def svg(self, corner: Point) -> str:
+        width, height = self.box
+        about = "\n".join((self.fold.name, *self.fold.nodes))
+        return "\n".join(
+            (
+                f"{_group(corner, 'item fold-box')}<title>{escape(about)}</title>"
+                f'<rect class="node fold" width="{width:.1f}" height="{height:.1f}" rx="5"'
+                f' style="fill: {colour_of(self.fold.name)}"/>',
+                f'<text class="title" x="{PAD}" y="18">{escape(self.fold.name)}</text>',
+                f'<text class="small" x="{PAD}" y="36">{escape(self.fold.text)}</text></g>',
+            )
+        )
+
+
+def folded_svg(folded: FoldedGraph, times: GraphTimes = NO_TIMES) -> str:
+    """Draw the picture of a folded application, as the text of an SVG file."""
+    return _picture(folded.shown, times, folded)
+
+
 def application_svg(application: ApplicationDescription, times: GraphTimes = NO_TIMES) -> str:
     """Draw the picture, as the text of an SVG file."""
-    nodes = _nodes(application, times)
+    return _picture(application, times, None)
+
+
+def _picture(
+    application: ApplicationDescription, times: GraphTimes, folded: FoldedGraph | None
+) -> str:
+    """Draw an application, and, where it is ``folded``, the boxes of its namespaces."""
+    drawn = _nodes(application, times)
     topics = [t for t in application.graph.topics if t and not t.startswith("ros_")]
-    arrows = list(_arrows(application, nodes, topics, times))
+    arrows = list(_arrows(application, drawn, topics, times))
+    nodes: list[_NodeBox | _FoldBox] = [*drawn]
+    if folded is not None:
+        nodes += (_FoldBox(number, part) for number, part in enumerate(folded.folds))
+        moved = len(folded.folds)  # topics come behind the folds
+        arrows = [arrow.behind(len(drawn), moved) for arrow in arrows]
+        arrows += _bundles(folded, drawn, topics)
     pills = [Box(CHARACTER * len(topic) + 2 * PAD, PILL) for topic in topics]
+    boxes = [*(node.box for node in nodes), *pills]
+    arrows.sort(key=lambda arrow: "chain" not in arrow.style)  # which turns no arrow of the chain
+    routed = arrows if folded is None else _strongest(arrows)
+    chain = next((a.edge.source for a in arrows if "chain" in a.style and _begins(a, arrows)), None)
     layout = lay_out(
-        [*(node.box for node in nodes), *pills],
-        [arrow.edge for arrow in arrows],
+        boxes,
+        [arrow.edge for arrow in routed],
         COLUMN_GAP if times is NO_TIMES else TIMED_GAP,
+        first=chain,
     )
+    if folded is not None:  # the others lead straight on, behind the boxes
+        placed = [*zip(routed, layout.routes, strict=True)]
+        placed += [(a, _straight(a.edge, boxes, layout)) for a in arrows if a not in routed]
+        placed.sort(key=lambda drawn: "bundle" not in drawn[0].style)
+        arrows = [arrow for arrow, _ in placed]
+        layout = layout._replace(routes=[route for _, route in placed])
     width, height = layout.width + 2 * MARGIN, layout.height + 2 * MARGIN
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" class="graph" width="{width:.0f}"'
@@ -313,11 +383,11 @@ def application_svg(application: ApplicationDescription, times: GraphTimes = NO_
         ' fill="#fff"/>',
     ]
     for route, arrow in zip(layout.routes, arrows, strict=True):
-        parts.append(_arrow(route, arrow.style))
+        parts.append(_arrow(route, arrow.style, arrow.about))
     parts += [node.svg(corner) for node, corner in zip(nodes, layout.corners, strict=False)]
     for topic, pill, corner in zip(topics, pills, layout.corners[len(nodes) :], strict=True):
         parts.append(
-            f"{_group(corner)}"
+            f"{_group(corner, 'item')}"
             f'<rect class="topic" width="{pill.width:.1f}" height="{PILL:.1f}" rx="13"/>'
             f'<text x="{pill.width / 2:.1f}" y="17" text-anchor="middle">{escape(topic)}</text></g>'
         )
@@ -327,6 +397,10 @@ def application_svg(application: ApplicationDescription, times: GraphTimes = NO_
             mean, most = f"{ms(arrow.time.mean)} ms", f"max {ms(arrow.time.max)}"
             parts.append(_time_text((x - 11, y - 5), mean, arrow.time.samples))
             parts.append(_time_text((x - 11, y + 13), most, arrow.time.samples))
+    if folded is not None and folded.common:
+        text = f"not drawn, for most of the boxes have them: {', '.join(folded.common)}"
+        y = layout.height + MARGIN - 2
+        parts.append(f'<text class="small" x="0" y="{y:.1f}">{escape(text)}</text>')
     if any(application.lost.values()):
         y, text = layout.height + MARGIN / 2, escape(lost_text(application.lost))
         parts.append(f'<text class="small" x="0" y="{y:.1f}">{text}</text>')
@@ -345,15 +419,36 @@ def _time_text(end: Point, text: str, samples: int) -> str:
 def timed_graph_svg(flow: DataFlow, graph: ApplicationGraph, chain: Chain | None = None) -> str:
     """Draw an application's graph with the times that were recorded, and a chain in it, as SVG.
 
-    Of more than `MOST_NODES` nodes, the chain's alone are drawn.
+    More than `MOST_NODES` nodes are folded by their namespaces, but the chain's.
     """
     application = without_internals(ApplicationDescription(graph, pl.DataFrame(), {}, ()))
+    times = _times(flow, chain)
+    if len(graph.nodes) > MOST_NODES:
+        return folded_svg(fold(application, chain), times)
+    return application_svg(application, times)
+
+
+def timed_fold_svgs(
+    flow: DataFlow, graph: ApplicationGraph, chain: Chain | None = None
+) -> list[tuple[Fold, str]]:
+    """Draw each namespace of an application by itself, as SVG, unfolded; the others stay folded.
+
+    An application of `MOST_NODES` nodes or fewer has none: the picture of it all shows them.
+    """
+    application = without_internals(ApplicationDescription(graph, pl.DataFrame(), {}, ()))
+    if len(graph.nodes) <= MOST_NODES:
+        return []
+    times = _times(flow, chain)
+    return [
+        (part, application_svg(_with_nodes_alone(application, {*part.nodes}), times))
+        for part in folds_of(application.graph)
+    ]
+
+
+def _times(flow: DataFlow, chain: Chain | None) -> GraphTimes:
+    """Return the times that a recording has of messages and callbacks, and a chain's arrows."""
     topics, callbacks = ((), ()) if chain is None else (chain.topics, chain.callbacks)
-    if chain is not None and len(graph.nodes) > MOST_NODES:
-        application = _with_nodes_alone(
-            application, {callback.node for callback in graph.path(chain)}
-        )
-    times = GraphTimes(
+    return GraphTimes(
         communication={
             (row["topic"], row["callback_id"]): _time(row["communication_ns"], row["count"])
             for row in edge_times(flow).iter_rows(named=True)
@@ -366,7 +461,6 @@ def timed_graph_svg(flow: DataFlow, graph: ApplicationGraph, chain: Chain | None
         reads=frozenset(zip(topics, callbacks[1:], strict=False)),
         writes=frozenset(zip(callbacks, topics, strict=True)),
     )
-    return application_svg(application, times)
 
 
 def _time(figures: Mapping[str, Any], samples: int) -> Time:
@@ -392,8 +486,8 @@ def _with_nodes_alone(
     return replace(application, graph=left)
 
 
-def _group(corner: Point) -> str:
-    return f'<g transform="translate({corner[0]:.1f} {corner[1]:.1f})">'
+def _group(corner: Point, kind: str) -> str:
+    return f'<g class="{kind}" transform="translate({corner[0]:.1f} {corner[1]:.1f})">'
 
 
 class _Arrow(NamedTuple):
@@ -402,6 +496,18 @@ class _Arrow(NamedTuple):
     edge: "Edge"
     style: str = "arrow"
     time: Time | None = None
+    about: str = ""  # what pointing at it says
+    topics: int = 1  # how many it stands for
+    of_topic: bool = False  # whether it leads to or from a topic
+
+    def behind(self, first: int, by: int) -> "_Arrow":
+        """Return the arrow where the boxes from ``first`` on have so much larger numbers."""
+        ends = {
+            name: end + by
+            for name, end in (("source", self.edge.source), ("target", self.edge.target))
+            if end >= first
+        }
+        return self._replace(edge=self.edge._replace(**ends))
 
 
 def _arrows(
@@ -438,7 +544,57 @@ def _arrows(
                 yield _Arrow(Edge(place[topic], index, PILL / 2, TITLE / 2))
 
 
-def _arrow(route: list[Point], style: str) -> str:
+def _bundles(
+    folded: FoldedGraph, drawn: Sequence[_NodeBox], topics: Sequence[str]
+) -> Iterator[_Arrow]:
+    """Yield the arrows that stand for many topics, and those between folds and topics."""
+    fold_height, first = (TITLE + ROW / 2) / 2, len(drawn)
+    place_of_topic = {topic: first + len(folded.folds) + n for n, topic in enumerate(topics)}
+    place_of_node = {node.name: number for number, node in enumerate(drawn)}
+
+    def end(box: int | str) -> tuple[int, float]:
+        if isinstance(box, int):
+            return first + box, fold_height
+        return place_of_node[box], TITLE / 2
+
+    for (source, target), names in folded.bundles.items():
+        (begins, leaves), (ends, enters) = end(source), end(target)
+        about = "\n".join((*names[:LISTED_TOPICS], *(["…"] if names[LISTED_TOPICS:] else [])))
+        edge = Edge(begins, ends, leaves, enters)
+        yield _Arrow(edge, "arrow bundle", about=about, topics=len(names))
+    for box, topic in sorted(folded.written):
+        edge = Edge(first + box, place_of_topic[topic], fold_height, PILL / 2)
+        yield _Arrow(edge, "arrow bundle", about=topic, of_topic=True)
+    for topic, box in sorted(folded.read):
+        edge = Edge(place_of_topic[topic], first + box, PILL / 2, fold_height)
+        yield _Arrow(edge, "arrow bundle", about=topic, of_topic=True)
+
+
+def _begins(arrow: _Arrow, arrows: Sequence[_Arrow]) -> bool:
+    """Return whether an arrow of the chain is its first."""
+    return not any("chain" in a.style and a.edge.target == arrow.edge.source for a in arrows)
+
+
+def _strongest(arrows: Sequence[_Arrow]) -> list[_Arrow]:
+    """Return the arrows by which boxes are placed: of many topics, the strongest of each box."""
+    most: dict[int, _Arrow] = {}
+    for arrow in arrows:
+        if "bundle" in arrow.style and not arrow.of_topic:
+            before = most.get(arrow.edge.source)
+            if before is None or before.topics < arrow.topics:
+                most[arrow.edge.source] = arrow
+    placing = {id(arrow) for arrow in most.values()}
+    return [arrow for arrow in arrows if "bundle" not in arrow.style or id(arrow) in placing]
+
+
+def _straight(edge: "Edge", boxes: Sequence["Box"], layout: "Layout") -> list[Point]:
+    """Return the route of an arrow that passes behind the boxes."""
+    (from_x, from_y), (to_x, to_y) = layout.corners[edge.source], layout.corners[edge.target]
+    start = (from_x + boxes[edge.source].width, from_y + edge.leaves)
+    return [start, (to_x, to_y + edge.enters)]
+
+
+def _arrow(route: list[Point], style: str, about: str = "") -> str:
     """Draw an arrow: horizontal ends, curves between columns.
 
     Backward arrows turn around at both ends.
@@ -456,7 +612,8 @@ def _arrow(route: list[Point], style: str) -> str:
             f" {to_x:.1f} {to_y:.1f}"
         )
         x, y, heading = to_x, to_y, after
-    return f'<path class="{style}{" back" if backwards else ""}" d="{" ".join(path)}"/>'
+    begun = f'<path class="{style}{" back" if backwards else ""}" d="{" ".join(path)}"'
+    return f"{begun}><title>{escape(about)}</title></path>" if about else f"{begun}/>"
 
 
 def application_dot(application: ApplicationDescription) -> str:
@@ -494,24 +651,59 @@ def _quoted(text: str) -> str:
 
 
 def write_picture(
-    application: ApplicationDescription, path: str | Path, *, everything: bool = False
+    application: ApplicationDescription,
+    path: str | Path,
+    *,
+    everything: bool = False,
+    chain: str | None = None,
+    unfolded: Sequence[str] = (),
 ) -> Path:
     """Write the graph as .svg, .png, .dot or .json, by ``path``'s ending, whole or not at all.
 
-    Raises InputError: it exists, its folder does not, or its ending says no known format.
-    OperationError: it cannot be written.
+    A picture of more than `MOST_NODES` nodes is folded by namespace; those that are ``unfolded``,
+    with all below them, and the nodes of the ``chain`` stand for themselves. The chain's arrows are
+    thick.
+
+    Raises InputError: it exists, its folder does not, its ending says no known format, or there is
+    no such chain or namespace. OperationError: it cannot be written.
     """
     path = new_file(path, ENDINGS)
     drawn = application if everything else without_internals(application)
+    known = None if chain is None else find_chain(application.graph, chain)
+    _refuse_unknown(application.graph, unfolded)
     if path.suffix == ".png":
-        return write_whole(path, [png_of(application_svg(drawn))])
+        return write_whole(path, [png_of(_folded_if_large(drawn, known, unfolded))])
     if path.suffix == ".json":
         text = json.dumps(application_json(application), indent=2) + "\n"
     elif path.suffix == ".dot":
         text = application_dot(drawn)
     else:
-        text = application_svg(drawn)
+        text = _folded_if_large(drawn, known, unfolded)
     return write_whole(path, [text.encode()])
+
+
+def _folded_if_large(
+    application: ApplicationDescription, chain: Chain | None, unfolded: Sequence[str]
+) -> str:
+    """Draw an application as SVG, without times; fold it where it is large."""
+    times = NO_TIMES
+    if chain is not None:
+        reads = frozenset(zip(chain.topics, chain.callbacks[1:], strict=False))
+        writes = frozenset(zip(chain.callbacks, chain.topics, strict=True))
+        times = GraphTimes({}, {}, reads, writes)
+    if len(application.graph.nodes) <= MOST_NODES:
+        return application_svg(application, times)
+    return folded_svg(fold(application, chain, unfolded), times)
+
+
+def _refuse_unknown(graph: ApplicationGraph, namespaces: Sequence[str]) -> None:
+    """Raise InputError if a namespace is that of no node."""
+    known = sorted({part.name.removesuffix("/…") for part in folds_of(graph)})
+    names = {node.name for node in graph.nodes} | {*known}
+    for wanted in namespaces:
+        if not any(name == wanted or name.startswith(f"{wanted.rstrip('/')}/") for name in names):
+            close = " or ".join(close_names(wanted, known)) or ", ".join(known[:5])
+            raise InputError(f"--unfold {wanted}: no node is in that namespace; write {close}")
 
 
 def png_of(svg: str) -> bytes:
@@ -582,9 +774,16 @@ class _ConnectedPart:
         return {v: place for column in self.columns for place, v in enumerate(column)}
 
 
-def lay_out(boxes: Sequence[Box], edges: Sequence[Edge], gap: float = COLUMN_GAP) -> Layout:
+def lay_out(
+    boxes: Sequence[Box],
+    edges: Sequence[Edge],
+    gap: float = COLUMN_GAP,
+    *,
+    first: int | None = None,
+) -> Layout:
     """Place boxes and edges, with a ``gap`` between columns.
 
+    Of edges that close a cycle, those that come first from the box ``first`` on lead forwards.
     The cost is about that of sorting, times the number of sweeps.
     """
     corners = [(0.0, 0.0)] * len(boxes)
@@ -594,7 +793,7 @@ def lay_out(boxes: Sequence[Box], edges: Sequence[Edge], gap: float = COLUMN_GAP
     for members in sorted(parts, key=len, reverse=True):
         chosen = set(members)
         edges_of_part = {number: edge for number, edge in enumerate(edges) if edge.source in chosen}
-        part = _layered(members, boxes, edges_of_part)
+        part = _layered(members, boxes, edges_of_part, first)
         _sort_columns(part)
         _choose_heights(part)
         sides, left = [], 0.0  # left and right side of every column
@@ -624,7 +823,9 @@ def lay_out(boxes: Sequence[Box], edges: Sequence[Edge], gap: float = COLUMN_GAP
     return Layout(corners, routes, width, max(top - 2 * ROW_GAP, 0.0))
 
 
-def _layered(chosen: list[int], boxes: Sequence[Box], edges: Mapping[int, Edge]) -> _ConnectedPart:
+def _layered(
+    chosen: list[int], boxes: Sequence[Box], edges: Mapping[int, Edge], first: int | None = None
+) -> _ConnectedPart:
     """Put boxes into columns by the longest path from the sources; add places for passing edges.
 
     Edges close a cycle if they lead back in the order of a depth-first search from the sources.
@@ -634,7 +835,8 @@ def _layered(chosen: list[int], boxes: Sequence[Box], edges: Mapping[int, Edge])
     for edge in edges.values():
         follows[edge.source].append(edge.target)
     entered = {edge.target for edge in edges.values()}
-    rank = depth_first_order(follows, sorted(chosen, key=entered.__contains__))
+    begun = sorted(chosen, key=lambda vertex: (vertex != first, vertex in entered))
+    rank = depth_first_order(follows, begun)
     ends = {
         number: tuple(sorted((edge.source, edge.target), key=rank.__getitem__, reverse=True))
         for number, edge in edges.items()

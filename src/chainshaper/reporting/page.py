@@ -35,7 +35,7 @@ from chainshaper.planning.overruns import slots_of_latency
 from chainshaper.reporting import latency as of_chain
 from chainshaper.reporting import overviews
 from chainshaper.reporting.cycle_parts import OPACITY, drawn_cycles, stacked_cycles
-from chainshaper.reporting.graph_drawing import timed_graph_svg
+from chainshaper.reporting.graph_drawing import timed_fold_svgs, timed_graph_svg
 from chainshaper.reporting.tables import ResultTable, figures, ms, slots_ms, words
 from chainshaper.reporting.timeline import Timeline, timeline_data, timeline_of
 from chainshaper.values.durations import duration_text
@@ -113,14 +113,15 @@ def report_page(
     shared, several = chains[0].measurements, len(chains) > 1
     names = distinct_names([measurement.recording.path for measurement in shared])
     # A recording is resolved once, however many chains it has.
-    recorded = {
-        id(measurement.recording): measurement.recording for measurement in all_measurements
-    }
-    flows = {key: recorded_flow(recording) for key, recording in recorded.items()}
-    page, of_each, style, script = (
+    flows: dict[int, DataFlow] = {}
+    for measurement in all_measurements:
+        if (key := id(measurement.recording)) not in flows:
+            flows[key] = measurement.flow or recorded_flow(measurement.recording)
+    page, of_each, style, *scripts = (
         (resources.files("chainshaper.reporting") / name).read_text("utf-8")
-        for name in ("page.html", "chain.html", "page.css", "page.js")
+        for name in ("page.html", "chain.html", "page.css", "page.js", "graph.js")
     )
+    script = "\n".join(f"{{{text}}}" for text in scripts)  # each with names of its own
     blocks, drawn = [], []
     for number, chain in enumerate(chains):
         parts = []
@@ -318,10 +319,23 @@ def _graph(part: _NamedMeasurement) -> str:
     """Make the HTML of the application's graph, with times of its edges and callbacks."""
     analysis = part.measurement.analysis
     drawing = timed_graph_svg(part.flow, analysis.graph, analysis.chain)
+    parts = timed_fold_svgs(part.flow, analysis.graph, analysis.chain)
     about = "Beside arrows: from publication to the start of the callback; beside callbacks: from"
     about += " start to end; mean, and maximum, of all that was recorded. Thick: the chain."
     title = f"The graph of {part.name}, with times"
     content = f'{_paragraph(about)}<div class="drawing">{drawing}</div>'
+    if parts:
+        nodes = sum(len(fold.nodes) for fold, _ in parts)
+        about = f"Its {nodes} nodes are folded by namespace, but those of the chain. A thin arrow"
+        about += " stands for several topics: point at it. Each namespace is below, unfolded."
+        field = '<input type="search" placeholder="a node, topic or function">'
+        search = f'<p class="search"><label>Find {field}</label> <output></output></p>'
+        inside = "".join(
+            f'<details class="fold"><summary>{escape(f"{fold.name} ({fold.text})")}</summary>'
+            f'<div class="drawing">{svg}</div></details>'
+            for fold, svg in parts
+        )
+        content = f'<div class="folded">{_paragraph(about)}{search}{content}{inside}</div>'
     return _details(title, content, unfolded=True)
 
 

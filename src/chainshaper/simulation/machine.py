@@ -95,7 +95,7 @@ class Machine:
         latencies: int,
     ) -> None:
         self._system, self._handles, self._plan, self._timing = system, handles, plan, timing
-        self._numbers = {process.pid: place for place, process in enumerate(system.processes)}
+        self._numbers = {process.node: place for place, process in enumerate(system.processes)}
         self._streams = Streams(system.application.seed)
         self._deliveries: dict[tuple[str, str, int], int] = {}
         self._groups: dict[tuple[int, str], int] = {}
@@ -155,7 +155,7 @@ class Machine:
         system, processes = self._system, []
         several = [0] * len(system.processes)
         for info in system.threads:
-            several[self._numbers[info.pid]] += info.role == "executor"
+            several[self._numbers[info.node or ""]] += info.role == "executor"
         kind = _EXECUTORS[system.application.simulation.executor]
         # Its loop, at which no executor looks, is the last entity of a process.
         of_process = [-1 if entity.kind == "loop" else entity.process for entity in system.entities]
@@ -173,11 +173,11 @@ class Machine:
     def _threads(self) -> list[_core.ThreadDescription]:
         system = self._system
         described, threads = system.application.simulation, []
-        executing: dict[int, int] = {}  # threads of a process's executor so far
+        executing: dict[str | None, int] = {}  # threads of a node's executor so far
         for info in system.threads:
             assert info.role is not None  # noqa: S101 - of a simulated thread it is known
-            worker = executing.get(info.pid, 0) if info.role == "executor" else 0
-            executing[info.pid] = executing.get(info.pid, 0) + (info.role == "executor")
+            worker = executing.get(info.node, 0) if info.role == "executor" else 0
+            executing[info.node] = executing.get(info.node, 0) + (info.role == "executor")
             if info.role == "loop":
                 worker = MOST_THREADS  # behind those of any executor
             place = ROLES.index(info.role) % OF_EXECUTORS + OF_EXECUTORS * worker
@@ -192,7 +192,7 @@ class Machine:
                     core=system.cores.index(info.cores[0]),
                     rank=BEST_EFFORT - info.priority,
                     role=getattr(_core.Role, info.role),
-                    process=self._numbers[info.pid],
+                    process=self._numbers[info.node or ""],
                     pid=info.pid,
                     tid=info.tid,
                     cpu=info.cores[0],
@@ -336,10 +336,10 @@ class Machine:
 
     def _loop(self, entity: Entity) -> _core.LoopDescription:
         process, reads = self._system.processes[entity.process], entity.described.reads
-        threads = [(info.pid, info.role) for info in self._system.threads]
+        threads = [(info.node, info.role) for info in self._system.threads]
         starts_chain = origin_timer(self._system.application)[1] is entity.described
         return _core.LoopDescription(
-            thread=threads.index((process.pid, "loop")),
+            thread=threads.index((process.node, "loop")),
             inputs=len(reads),
             last_ns=self._timing.last_timer_ns if starts_chain else self._timing.stop_ns,
             ends_chain=self._system.chain.topics[-1:] == (process.node + LOOP_END,),

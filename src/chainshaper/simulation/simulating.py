@@ -83,7 +83,10 @@ def simulate(
         kernel="none",
         clock_offset_ns=0,
         command=tuple(command),
-        processes={process.pid: process.node for process in system.processes},
+        processes={
+            process.pid: application.nodes[process.key].container or process.node
+            for process in system.processes
+        },
         threads=system.threads,
         realtime=True,
         notes=("simulated",),
@@ -211,7 +214,13 @@ def _event_tables(
 
 def _create_objects(system: System) -> tuple[list[live.ProcessLog], Handles]:
     """Give every object a handle, unique in its process, and note its creation."""
-    logs = [EventLog(clock=lambda: 0) for _ in system.processes]
+    first_of: dict[int, EventLog] = {}  # of a process, whose handles all of its nodes number
+    logs = []
+    for process in system.processes:
+        first = first_of.get(process.pid)
+        new_handle = None if first is None else first.new_handle
+        logs.append(EventLog(clock=lambda: 0, new_handle=new_handle))
+        first_of.setdefault(process.pid, logs[-1])
     for process, log in zip(system.processes, logs, strict=True):
         log.node(process.node, "simulation")
     publishers = [

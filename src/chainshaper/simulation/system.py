@@ -57,11 +57,11 @@ class SimulatedPublisher(NamedTuple):
 
 
 class SimulatedProcess(NamedTuple):
-    """A node's process."""
+    """A node's process, or its part of a container's."""
 
     node: str  # full name
     key: str  # the node's name in the description
-    pid: int
+    pid: int  # nodes of a container have it in common
 
 
 @dataclass(frozen=True)
@@ -92,10 +92,7 @@ def build_system(
     Raises InputError: the application's chain is not one path through it, or a server of the plan
     has a thread that the application does not have.
     """
-    processes = tuple(
-        SimulatedProcess(node_name(key), key, FIRST_PID + 10 * number)
-        for number, key in enumerate(application.nodes)
-    )
+    processes = tuple(_processes(application))
     entities: list[Entity] = []
     publishers: list[SimulatedPublisher] = []
     order = STATIC_ORDER if application.simulation.executor == "static" else KINDS
@@ -130,6 +127,16 @@ def build_system(
         chain=chain,
         modes=tuple(dict.fromkeys(modes)),
     )
+
+
+def _processes(application: Application) -> Iterator[SimulatedProcess]:
+    """Yield each node's process; nodes of a container share the pid of its first."""
+    pids: dict[str, int] = {}
+    for number, (key, node) in enumerate(application.nodes.items()):
+        pid = FIRST_PID + 10 * number
+        if node.container is not None:
+            pid = pids.setdefault(node.container, pid)
+        yield SimulatedProcess(node_name(key), key, pid)
 
 
 def _entities(
@@ -179,7 +186,7 @@ def _threads(
         if (loop := application.loop_scheduling_of(process.key)) is not None:
             threads.append(("loop", LOOP_NAME, loop.core, loop.priority))
         for place, (role, comm, core, priority) in enumerate(threads):
-            tid = process.pid + ROLES.index(role)
+            tid = FIRST_PID + 10 * number + ROLES.index(role)
             if 0 < place < len(executing):
                 tid = FIRST_TID + 100 * number + place
             yield ThreadInfo(

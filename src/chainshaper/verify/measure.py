@@ -93,6 +93,7 @@ class Measurement:
     prediction: JudgedPrediction | None
     left_out: LeftOut  # of the recording
     age: JudgedAge | None = None  # of the data of the plan's loop; None: the plan has no loop
+    flow: DataFlow | None = None  # of the recording, where the caller wanted to keep it
 
     def __repr__(self) -> str:
         about = f"{self.analysis.chain.spec}: {self.analysis.statistics.text}"
@@ -207,13 +208,18 @@ def _measured(
     flow: DataFlow | None = None,
     *,
     declaring: Plan | None = None,
+    with_flow: bool = False,
 ) -> list[Measurement]:
-    """Measure several chains in a recording; its events are resolved once."""
+    """Measure several chains in a recording; its events are resolved once.
+
+    Keep what they were resolved to in the measurements if ``with_flow``, and all was measured.
+    """
     joint, info = _plan_of(recording, plan), recording.info
     due = [] if joint is None else [due for planned in joint.chains for due in due_of(planned)]
     spell, left_out = _in_force(recording)
     flow = _declaring(flow or recorded_flow(recording), joint or declaring)
     recording = with_declared(recording, flow.through)
+    kept = flow if with_flow and spell is None else None
     if (
         gated := [planned for planned in joint.chains if any(publisher_servers(planned))]
         if joint
@@ -263,6 +269,7 @@ def _measured(
                 else None,
                 left_out=left_out,
                 age=_judged_age(own_plan, whole, recording),
+                flow=kept,
             )
         )
     return measurements
@@ -359,11 +366,13 @@ def compare_chains(
     *,
     least: int = 2,
     progress: Callable[[float, str], None] = lambda *_: None,
+    with_flow: bool = False,
 ) -> tuple[Comparison, ...]:
     """Measure every chain of an application in ``least`` recordings or more.
 
     If the plan in force in the last of them has several chains, these are measured; else the chain
-    that each recording names. ``chain`` selects one. Raises: as :func:`compare_recordings`.
+    that each recording names. ``chain`` selects one. ``with_flow`` keeps the recordings' data flows
+    in the measurements, for what needs them too. Raises: as :func:`compare_recordings`.
     """
     if len(recordings) < least:
         raise InputError("a comparison needs two recordings, such as `compare before after`")
@@ -380,7 +389,7 @@ def compare_chains(
     for number, recording in enumerate(opened_recordings, start=1):
         progress((number - 1) / len(opened_recordings), f"analysing {recording.path}")
         in_force = plan if number == len(opened_recordings) else None
-        columns.append(_measured(recording, chains, in_force, declaring=joint))
+        columns.append(_measured(recording, chains, in_force, declaring=joint, with_flow=with_flow))
     return tuple(
         Comparison(measurements[0].analysis.chain.spec, measurements)
         for measurements in zip(*columns, strict=True)

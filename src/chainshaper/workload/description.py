@@ -42,6 +42,7 @@ MOST_CORES = 8191  # that Linux can be built for
 MOST_THREADS = 64
 _FUNCTION = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", re.ASCII)
 _NODE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+_CONTAINER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 Core: TypeAlias = Annotated[int, Field(ge=0, le=MOST_CORES)]
 Priority: TypeAlias = Annotated[int, Field(ge=1, le=97)]  # 98 and 99 stay free for measuring
 Pair: TypeAlias = tuple[Duration, Duration]
@@ -345,8 +346,10 @@ class CallbackDescription(Part):
 
 
 class NodeDescription(Part):
-    """A node in a process of its own.
+    """A node in a process of its own, or in a container.
 
+    * ``container``: the name of a process that it shares with other nodes of this container; each
+      has the threads of its executor for itself, as in ``component_container_isolated``.
     * ``core``, ``priority``, ``dds_priority``: instead of those in ``scheduling``.
     * ``bound``: whether it stays on its core. If not, it runs on any core in a live run; in a
       simulation it runs on its core all the same.
@@ -360,6 +363,7 @@ class NodeDescription(Part):
     core: Core | None = None
     priority: Priority | None = None
     dds_priority: Priority | None = None
+    container: str | None = None
     bound: bool = True
     executor: Literal["single_threaded", "multi_threaded"] = "single_threaded"
     threads: int = Field(default=1, ge=1, le=MOST_THREADS)
@@ -370,6 +374,9 @@ class NodeDescription(Part):
 
     @model_validator(mode="after")
     def _executor_exists(self) -> "NodeDescription":
+        if self.container is not None and not _CONTAINER.fullmatch(self.container):
+            reason = "a container's name has letters, digits and _ only, and begins with a letter"
+            raise wrong_value(reason, "container")
         if self.executor == "single_threaded":
             for key in ("callback_groups", "cores", "threads"):
                 if getattr(self, key) not in ({}, (), 1):

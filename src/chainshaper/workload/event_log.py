@@ -69,12 +69,19 @@ def number_of(field: str, word: str | None) -> int:
 
 
 class EventLog:
-    """The events of a process, and the creation of its node's objects, which get their handles."""
+    """The events of a process, and the creation of its node's objects, which get their handles.
 
-    def __init__(self, clock: Callable[[], int] = monotonic_ns) -> None:
+    Logs of several nodes in one process take their handles from one `new_handle`.
+    """
+
+    def __init__(
+        self,
+        clock: Callable[[], int] = monotonic_ns,
+        new_handle: Callable[[], int] | None = None,
+    ) -> None:
         self._blocks = [array("q")]
         self.objects: list[dict[str, Any]] = []  # the init events, which carry names
-        self.new_handle: Callable[[], int] = partial(next, count(FIRST_HANDLE, 0x100))
+        self.new_handle = new_handle or partial(next, count(FIRST_HANDLE, 0x100))
         self._clock = clock
         self._node = self.new_handle()
 

@@ -514,6 +514,7 @@ def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataF
     They have the events from ``from_ns`` on, and the creation of all objects.
     """
     parts: dict[str, list[pl.DataFrame]] = {}
+    created: dict[str, list[dict[str, Any]]] = {}  # by event, of all processes: there are many
     for log in logs:
         rows = np.frombuffer(log.rows, dtype=np.int64).reshape(-1, WIDTH)
         rows = rows[rows[:, 1] >= from_ns]
@@ -525,10 +526,11 @@ def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataF
         for name, table in logged_tables(entries, log.modes):
             parts.setdefault(name, []).append(table)
         main_thread = {**log.process(), "tid": log.pid}
-        for name in dict.fromkeys(created["event"] for created in log.objects):
-            of_event = [created for created in log.objects if created["event"] == name]
-            frame = pl.DataFrame([created | main_thread for created in of_event])
-            parts.setdefault(name, []).append(typed_table(name, frame))
+        for of_object in log.objects:
+            created.setdefault(of_object["event"], []).append(of_object | main_thread)
+    for name, rows_of_event in created.items():
+        frame = pl.DataFrame(rows_of_event, infer_schema_length=None)
+        parts.setdefault(name, []).append(typed_table(name, frame))
     return {
         name: pl.concat(tables).sort("time", maintain_order=True)
         for name, tables in sorted(parts.items())
