@@ -80,7 +80,9 @@ def test_the_cost_of_an_integrator_with_a_constant_delay_is_that_by_hand(delay: 
     loop = integrator(0.8)
     expected = cost_of_integrator(0.8, 1.0, [delay], [1.0])
     assert cost_of_constant(loop, delay) == pytest.approx(expected, rel=1e-12)
-    assert LatencyCosts(loop).cost(np.array([round(delay * S)])) == pytest.approx(expected, rel=1e-9)
+    assert LatencyCosts(loop).cost(np.array([round(delay * S)])) == pytest.approx(
+        expected, rel=1e-9
+    )
 
 
 @pytest.mark.parametrize(("first", "second", "share"), [(0.0, 0.9, 0.5), (0.2, 0.6, 0.1)])
@@ -89,7 +91,9 @@ def test_the_cost_of_a_delay_with_two_values_is_that_by_hand(
 ) -> None:
     loop = integrator(0.8)
     expected = cost_of_integrator(0.8, 1.0, [first, second], [1 - share, share])
-    latencies = np.array([round(first * S)] * round(10 * (1 - share)) + [round(second * S)] * round(10 * share))
+    latencies = np.array(
+        [round(first * S)] * round(10 * (1 - share)) + [round(second * S)] * round(10 * share)
+    )
     assert LatencyCosts(loop).cost(latencies) == pytest.approx(expected, rel=1e-9)
 
 

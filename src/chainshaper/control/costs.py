@@ -12,6 +12,7 @@ is a sample, or an output that arrives. What is treated how:
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,11 +47,13 @@ class SequenceCost:
 
 @dataclass(frozen=True)
 class Events:
-    """What happens in a loop, in the order of time: ``slots`` as for `_core.propagate_covariance`."""
+    """What happens in a loop, in the order of time."""
 
     waits_s: NDArray[np.float64]
     slots: NDArray[np.int32]
-    under_way: int  # how many slots there are: outputs that may be on their way at a sample, and one
+    under_way: (
+        int  # how many slots there are: outputs that may be on their way at a sample, and one
+    )
 
 
 def events_of(
@@ -85,9 +88,7 @@ def events_of(
     slots = np.concatenate([~slot, slot[inside], [_core.NO_EVENT]]).astype(np.int32)
     # Of one instant an arrival of an earlier sample is first; that of its own sample comes behind
     # it: with a latency of 0 the sample's output is applied at once.
-    rank = np.concatenate(
-        [np.full(count, 1), np.where(latencies_ns[inside] == 0, 2, 0), [3]]
-    )
+    rank = np.concatenate([np.full(count, 1), np.where(latencies_ns[inside] == 0, 2, 0), [3]])
     order = np.lexsort((rank, times))
     return Events(np.diff(times[order], prepend=times[order[0]]) / 1e9, slots[order], under_way)
 
@@ -156,7 +157,7 @@ def _margin(costs: NDArray[np.float64], durations_s: NDArray[np.float64]) -> flo
     ends = np.linspace(0, len(costs), BATCHES + 1).astype(int)
     averages = [
         costs[begin:end].sum() / durations_s[begin:end].sum()
-        for begin, end in zip(ends, ends[1:], strict=False)
+        for begin, end in pairwise(ends.tolist())
     ]
     return float(SURE * np.std(averages, ddof=1) / np.sqrt(BATCHES))
 

@@ -24,7 +24,9 @@ def periods_of_delay(problem: Problem, delay_s: float) -> int:
     return max(1, math.ceil(delay_s / problem.period_s - 1e-12))
 
 
-def design_controller(problem: Problem, delay_s: float, remembered: int | None = None) -> Controller:
+def design_controller(
+    problem: Problem, delay_s: float, remembered: int | None = None
+) -> Controller:
     """Return the LQG controller for a constant delay.
 
     ``remembered`` is d, if it is to be more than the delay needs: controllers of equally many have
@@ -64,7 +66,7 @@ def design_controller(problem: Problem, delay_s: float, remembered: int | None =
         cost[n : past(needed).start] = cost[:, n : past(needed).start] = 0.0
     a, b = moved[:, : size - m], moved[:, size - m :]
     q, r, cross = cost[:-m, :-m], cost[-m:, -m:], cost[:-m, -m:]
-    riccati = _riccati(a, b, q, r, cross, "no controller stabilises the plant")
+    riccati = _riccati(a, b, q, r, cross, failing="no controller stabilises the plant")
     gain = _solved(r + b.T @ riccati @ b, cross.T + b.T @ riccati @ a)
     closed = np.abs(np.linalg.eigvals(a - b @ gain)).max()
     if not closed < 1 + 1e-9:
@@ -76,7 +78,7 @@ def design_controller(problem: Problem, delay_s: float, remembered: int | None =
         whole.noise,
         problem.measurement_noise,
         np.zeros((n, plant.outputs)),
-        "no observer sees all of the plant",
+        failing="no observer sees all of the plant",
     )
     seen = plant.c @ predicted @ plant.c.T + problem.measurement_noise
     kalman = np.linalg.lstsq(seen.T, (predicted @ plant.c.T).T, rcond=None)[0].T
@@ -104,7 +106,7 @@ def _solved(left: Matrix, right: Matrix) -> Matrix:
     return solution
 
 
-def _riccati(a: Matrix, b: Matrix, q: Matrix, r: Matrix, cross: Matrix, failing: str) -> Matrix:
+def _riccati(a: Matrix, b: Matrix, q: Matrix, r: Matrix, cross: Matrix, *, failing: str) -> Matrix:
     """Return the stabilising solution of the discrete Riccati equation.
 
     Where R is singular, as behind a delay, or SciPy finds none, it is the limit of the horizon that

@@ -63,7 +63,9 @@ class Flows:
         block[size : 2 * size, 2 * size :] = self.weights
         block[2 * size :, 2 * size :] = self.dynamics
         # A stiff plant's exponential of −Aᵀ overflows: go on from half the time, doubling.
-        halves = max(0, int(np.ceil(np.log2(max(np.abs(self.dynamics).sum() * duration_s, 1e-300)))))
+        halves = max(
+            0, int(np.ceil(np.log2(max(np.abs(self.dynamics).sum() * duration_s, 1e-300))))
+        )
         step = duration_s / 2**halves
         whole = exponential(block * step)
         transition = whole[2 * size :, 2 * size :]

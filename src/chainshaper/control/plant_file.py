@@ -50,7 +50,9 @@ MOST_COEFFICIENTS = 25
 
 
 class _Matrices(Part):
-    model_config = ConfigDict(**{**Part.model_config, "alias_generator": str.upper, "strict": False})  # type: ignore[misc]
+    model_config = ConfigDict(
+        **{**Part.model_config, "alias_generator": str.upper, "strict": False}
+    )  # type: ignore[misc]
 
 
 class StateSpacePart(_Matrices):
@@ -176,7 +178,9 @@ class LoopDescription:
     def loop(self, period_ns: int | None = None) -> Loop:
         """Return the loop with its controller, given or designed. Raises: as :meth:`problem`."""
         problem = self.problem(period_ns)
-        return Loop(problem, self.controller or design_controller(problem, (self.delay_ns or 0) / 1e9))
+        return Loop(
+            problem, self.controller or design_controller(problem, (self.delay_ns or 0) / 1e9)
+        )
 
     def redesigned(self, delay_ns: float, period_ns: int | None = None) -> Loop:
         """Return the loop with the LQG controller for another constant delay."""
@@ -212,7 +216,9 @@ def _described(path: Path, written: LoopFile) -> LoopDescription:
         noise += covariance(written.noise.process_state, n, "noise.process_state")
     cost = np.zeros((n + m, n + m))
     if written.cost.output is not None:
-        cost[:n, :n] += plant.c.T @ covariance(written.cost.output, outputs, "cost.output") @ plant.c
+        cost[:n, :n] += (
+            plant.c.T @ covariance(written.cost.output, outputs, "cost.output") @ plant.c
+        )
     if written.cost.state is not None:
         cost[:n, :n] += covariance(written.cost.state, n, "cost.state")
     if written.cost.input is not None:
@@ -258,8 +264,6 @@ def _controller(written: ControllerPart) -> Controller | None:
     space: Any = written.state_space
     k = matrix(space.k, "K")
     if not space.f:
-        return Controller(
-            np.zeros((0, 0)), np.zeros((0, k.shape[1])), np.zeros((len(k), 0)), k
-        )
+        return Controller(np.zeros((0, 0)), np.zeros((0, k.shape[1])), np.zeros((len(k), 0)), k)
     f, g, h = (matrix(getattr(space, name), name.upper()) for name in "fgh")
     return Controller(f, g, h, k)

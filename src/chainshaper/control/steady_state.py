@@ -108,7 +108,9 @@ def radius_of_constant(loop: Loop, latency_s: float, flows: Flows | None = None)
 
 def cost_of_constant(loop: Loop, latency_s: float, flows: Flows | None = None) -> float:
     """Return the cost per second with a constant latency, also above the period; inf: unstable."""
-    whole, noise, weights, noise_cost = steady_period(loop, latency_s, 1, flows or Flows(loop.problem))
+    whole, noise, weights, noise_cost = steady_period(
+        loop, latency_s, 1, flows or Flows(loop.problem)
+    )
     if np.abs(np.linalg.eigvals(whole)).max() >= STABLE:
         return float("inf")
     covariance = scipy_linalg().solve_discrete_lyapunov(whole, noise)
@@ -279,7 +281,9 @@ class LatencyCosts:
             part = averages[begin : begin + 256]
             left = np.eye(size) - (part[:, :products] @ operators).reshape(-1, size, size)
             try:
-                covariance = np.linalg.solve(left, np.broadcast_to(noise, (len(part), size))[..., None])[..., 0]
+                covariance = np.linalg.solve(
+                    left, np.broadcast_to(noise, (len(part), size))[..., None]
+                )[..., 0]
             except np.linalg.LinAlgError:
                 covariance = np.full((len(part), size), np.nan)
             weights = part[:, products:] @ linear

@@ -3,8 +3,8 @@
 The candidates are one slot, several bands, and one long slot, which begins anywhere before the last
 slot's end (the unshaped chain is the long slot that begins at once). Of each, the cost is that of
 the steady state in which every cycle's latency is drawn from those measured, and leaves as the
-slots have it (:mod:`chainshaper.control.steady_state`). The controller is the one that is given; or,
-with one slot, it may be designed anew for the delay, which is constant then.
+slots have it (:mod:`chainshaper.control.steady_state`). The controller is the one that is given;
+or, with one slot, it may be designed anew for the delay, which is constant then.
 
 **What is searched.** Up to `MOST_TRIED` placements on the grid are all tried. Of more, those on a
 coarser grid are; from the best of these the search goes on by halving the grid, down to the one
@@ -36,6 +36,7 @@ from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 
 MOST_TRIED = 12_000  # placements of one kind of which all are tried
+LEAST_GAIN = 1e-3  # of the cost, for which shaping is worth it
 STARTS = 8  # placements of the coarser grid from which the search goes on
 MOST_BANDS = 3  # that are tried where the request names no number; 4 for `auto`
 ONE_SLOT, LONG_SLOT, REDESIGNED = "one slot", "one long slot", "one slot, redesigned"
@@ -192,7 +193,7 @@ def with_least_cost(
     that is tried. With ``redesign`` the controller may be designed anew for a constant delay.
 
     Raises InputError: as :func:`~chainshaper.control.plant_file.load_loop`, or latencies are above
-    the period. OperationError: the loop is unstable with any slots. PlatformError: SciPy is missing.
+    the period. OperationError: the loop is unstable with any slots. PlatformError: no SciPy.
     """
     description = load_loop(plant)
     loop = description.loop(profile.period_ns)
@@ -203,7 +204,11 @@ def with_least_cost(
     numbers: Sequence[int] = range(1, MOST_BANDS + 1 + (bands == "auto"))
     if bands not in (1, "auto"):
         numbers = [int(bands)]
-    tried = [best_bands(averages, number, mean_at_most_ns) for number in numbers if number <= problem.room]
+    tried = [
+        best_bands(averages, number, mean_at_most_ns)
+        for number in numbers
+        if number <= problem.room
+    ]
     if bands in (1, "auto") and plan.into_open_slot == "at-once":
         tried.append(best_long_slot(averages))
     candidates = [candidate for candidate in tried if candidate is not None]
@@ -211,9 +216,7 @@ def with_least_cost(
     start = problem.last_end_ns - problem.publish_slot_ns
     if redesign and 1 in numbers:
         redesigned = _redesigned(description, profile.period_ns, start)
-        candidates.append(
-            Candidate(REDESIGNED, ((start, problem.last_end_ns),), redesigned)
-        )
+        candidates.append(Candidate(REDESIGNED, ((start, problem.last_end_ns),), redesigned))
     chosen = min(candidates, key=lambda candidate: candidate.cost, default=None)
     if chosen is None or not np.isfinite(chosen.cost):
         raise OperationError(_unstable(loop, plant, start))
@@ -225,7 +228,7 @@ def with_least_cost(
         chosen=chosen.name,
         delay_ns=start if chosen.name == REDESIGNED else None,
         alternatives=kept,
-        worth=chosen.cost < unshaped,
+        worth=chosen.cost < unshaped * (1 - LEAST_GAIN),
     )
     return revised(_with_slots(plan, profile, problem, chosen), control=control)
 

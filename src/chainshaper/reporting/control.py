@@ -13,7 +13,7 @@ from chainshaper.control.modes import ModeCosts
 from chainshaper.control.steady_state import LatencyCosts, covariance_of_constant
 from chainshaper.planning.chain_plan import ControlCost
 from chainshaper.reporting.figures import COLOURS, ENDINGS, new_figure, save_figure, user_style
-from chainshaper.reporting.tables import ABSENT, ResultTable, figures, ms, words
+from chainshaper.reporting.tables import ABSENT, ResultTable, cost_text, figures, ms, words
 from chainshaper.values.durations import duration_text
 from chainshaper.values.files import new_file
 from chainshaper.verify.control import ControlCosts, ControlledRecording
@@ -22,13 +22,6 @@ JSON_FORMAT = 1
 SHOWN_CYCLES = 120  # of each recording's drawn run
 MAP_POINTS = 33  # of the map, along each side
 LATENCIES_OF_POINT = 21  # of a uniform distribution with a point's average and jitter
-
-
-def cost_text(cost: float | None) -> str:
-    """Return a cost with four figures: ``1.413``; ``unstable``; a dash for None."""
-    if cost is None:
-        return ABSENT
-    return f"{cost:.4g}" if math.isfinite(cost) else "unstable"
 
 
 def _finite(cost: float | None) -> float | None:
@@ -42,7 +35,10 @@ def control_table(costs: ControlCosts) -> ResultTable:
     columns = [*words("recording"), *figures("cycles", "lost", "average", "jitter", "cost", "±")]
     columns += figures(*constants)
     table = ResultTable(f"Cost of the control loop {costs.description.path.name}", columns)
-    table.caption = f"cost per second; {_margin_text(costs)}; times in ms"
+    table.caption = (
+        f"cost per second; redesigned: with the controller for that constant latency;\n"
+        f"{_margin_text(costs)}; times in ms"
+    )
     for recording in costs.recordings:
         came = recording.came_ns
         table.add(
@@ -56,7 +52,7 @@ def control_table(costs: ControlCosts) -> ResultTable:
             *(cost_text(constant.cost) for constant in recording.constants),
         )
         redesigned = [cost_text(constant.redesigned) for constant in recording.constants]
-        table.add("  controller redesigned for it", *[""] * 6, *redesigned)
+        table.add("  redesigned", *[""] * 6, *redesigned)
     return table
 
 
@@ -219,9 +215,16 @@ def _draw_map(axes: Any, costs: ControlCosts) -> None:
     stable = np.isfinite(field)
     if stable.any():
         top = float(np.quantile(field[stable], 0.9))
-        levels = np.linspace(float(field[stable].min()), max(top, float(field[stable].min()) + 1e-12), 13)
+        levels = np.linspace(
+            float(field[stable].min()), max(top, float(field[stable].min()) + 1e-12), 13
+        )
         drawn = axes.contourf(
-            means / 1e6, means / 1e6, np.where(stable, field, np.nan), levels, cmap="viridis_r", extend="max"
+            means / 1e6,
+            means / 1e6,
+            np.where(stable, field, np.nan),
+            levels,
+            cmap="viridis_r",
+            extend="max",
         )
         axes.figure.colorbar(drawn, ax=axes, label="cost per second")
     for recording, colour in zip(costs.recordings, cycle(COLOURS), strict=False):

@@ -27,6 +27,7 @@ from chainshaper.reporting.tables import (
     YES_NO,
     Column,
     ResultTable,
+    cost_text,
     counted,
     figures,
     listed,
@@ -711,6 +712,8 @@ def broken_table(broken: "Sequence[Judged]") -> ResultTable:
     table = ResultTable("Limits that are broken", [*columns, *words("because")])
     for judged in broken:
         shown = percent if judged.is_share else ms
+        if judged.is_cost:
+            shown = cost_text
         values = shown(judged.limit), shown(judged.measured)
         table.add(judged.recording, judged.where, judged.figure, *values, judged.because or "")
     return table
@@ -744,12 +747,17 @@ def sweep_table(frame: pl.DataFrame) -> ResultTable:
     """Make a table of a sweep: the axes and most important figures of the first points."""
     axes = sweep_axes(frame)
     names = [name.removesuffix("_ns") for name in (*axes, *SWEEP_FIGURES.values())]
+    has_cost = frame["control_cost"].count() > 0
+    names += ["control cost"] if has_cost else []
     table = ResultTable("Simulated end-to-end latency [ms]", figures(*names))
     for row in frame.head(MOST_ROWS).to_dicts():
         row["kept"] = PROMISE[row["kept"]]
         cells = [
             ms(row[figure]) if figure.endswith("_ns") else row[figure] for figure in SWEEP_FIGURES
         ]
+        if has_cost:
+            cost = row["control_cost"]
+            cells.append("unstable" if cost is None else f"{cost:.4g}")
         if row["error"] is not None:
             cells = ["failed", *([""] * (len(cells) - 1))]
         table.add(*(sweep_value(name, row[name]) for name in axes), *cells)

@@ -213,14 +213,14 @@ def over_cycles(
         else:
             cost = float("inf")
         constants.append(
-            ConstantCost(percentile, latency_ns, cost, _redesigned(description, latency_ns, period_ns))
+            ConstantCost(
+                percentile, latency_ns, cost, _redesigned(description, latency_ns, period_ns)
+            )
         )
     return sequence, steady, tuple(constants)
 
 
-def _redesigned(
-    description: LoopDescription, latency_ns: int, period_ns: int
-) -> float | None:
+def _redesigned(description: LoopDescription, latency_ns: int, period_ns: int) -> float | None:
     try:
         return cost_of_constant(description.redesigned(latency_ns, period_ns), latency_ns / 1e9)
     except InputError:
