@@ -73,7 +73,7 @@ def plant_of_order_four() -> Loop:
 
 def cycles(
     count: int, seed: int, longest_ns: int, lost: float = 0.0
-) -> tuple[NDArray[np.int64], ...]:
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     random = np.random.default_rng(seed)
     samples = np.arange(count) * PERIOD + random.integers(0, 3 * MS, count)
     latencies = random.integers(5 * MS, longest_ns, count)

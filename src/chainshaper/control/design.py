@@ -102,7 +102,7 @@ def _no_controller(reason: str) -> str:
 
 
 def _solved(left: Matrix, right: Matrix) -> Matrix:
-    solution: Matrix = np.linalg.lstsq(left, right, rcond=None)[0]
+    solution: Matrix = np.linalg.lstsq(left, right, rcond=None)[0].astype(np.float64)
     return solution
 
 
@@ -118,11 +118,12 @@ def _riccati(a: Matrix, b: Matrix, q: Matrix, r: Matrix, cross: Matrix, *, faili
         try:
             solution: Matrix = linalg.solve_discrete_are(a, b, q, r, s=cross)
             if np.isfinite(solution).all():
-                return (solution + solution.T) / 2
+                symmetric: Matrix = (solution + solution.T) / 2
+                return symmetric
         except (np.linalg.LinAlgError, ValueError):
             pass
     # From the horizon of one step with a cost at its end that makes R + Bᵀ·X·B regular.
-    current = np.eye(len(a)) * max(float(np.abs(q).max()), 1e-12)
+    current: Matrix = np.eye(len(a)) * max(float(np.abs(q).max()), 1e-12)
     for _ in range(200_000 // max(1, len(a))):
         weight = r + b.T @ current @ b
         gain = _solved(weight, cross.T + b.T @ current @ a)

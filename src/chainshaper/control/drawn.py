@@ -48,7 +48,8 @@ def draw(
     sample_root = from_sample @ root_of(loop.problem.measurement_noise)
     flowing, seen = parts["plant"].stop, slice(parts["plant"].start, parts["controller"].stop)
     cost, now = np.zeros(runs), 0.0
-    times, outputs, inputs = [], [], []
+    times: list[float] = []
+    outputs, inputs = list[NDArray[np.float64]](), list[NDArray[np.float64]]()
     known_flows: dict[float, tuple[Flow, Matrix]] = {}
     begun = 0.0
     for wait, slot in zip(events.waits_s.tolist(), events.slots.tolist(), strict=True):

@@ -62,7 +62,8 @@ def covariance(values: ArrayLike, size: int, name: str) -> Matrix:
         raise InputError(f"{name} is not symmetric: write the same number on both sides")
     if np.linalg.eigvalsh(array).min() < -1e-9 * scale:
         raise InputError(f"{name} has a negative eigenvalue: noise and costs are 0 or more")
-    return (array + array.T) / 2
+    symmetric: Matrix = (array + array.T) / 2
+    return symmetric
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ class Plant:
 
     @property
     def inputs(self) -> int:
-        return self.b.shape[1]
+        return int(self.b.shape[1])
 
     @property
     def outputs(self) -> int:

@@ -52,7 +52,7 @@ MOST_COEFFICIENTS = 25
 class _Matrices(Part):
     model_config = ConfigDict(
         **{**Part.model_config, "alias_generator": str.upper, "strict": False}
-    )  # type: ignore[misc]
+    )
 
 
 class StateSpacePart(_Matrices):
@@ -67,7 +67,7 @@ class StateSpacePart(_Matrices):
 class TransferFunctionPart(Part):
     """Coefficients, the highest power of s first."""
 
-    model_config = ConfigDict(**{**Part.model_config, "strict": False})  # type: ignore[misc]
+    model_config = ConfigDict(**{**Part.model_config, "strict": False})
 
     numerator: Row = Field(min_length=1, max_length=MOST_COEFFICIENTS)
     denominator: Row = Field(min_length=2, max_length=MOST_COEFFICIENTS)
@@ -85,7 +85,7 @@ class PlantPart(Part):
 
 
 class NoisePart(Part):
-    model_config = ConfigDict(**{**Part.model_config, "strict": False})  # type: ignore[misc]
+    model_config = ConfigDict(**{**Part.model_config, "strict": False})
 
     process: Weights | None = None
     process_state: Weights | None = None
@@ -93,7 +93,7 @@ class NoisePart(Part):
 
 
 class CostPart(Part):
-    model_config = ConfigDict(**{**Part.model_config, "strict": False})  # type: ignore[misc]
+    model_config = ConfigDict(**{**Part.model_config, "strict": False})
 
     output: Weights | None = None
     state: Weights | None = None
@@ -110,7 +110,7 @@ class ControllerMatrices(_Matrices):
 
 
 class ControllerPart(Part):
-    model_config = ConfigDict(**{**Part.model_config, "strict": False})  # type: ignore[misc]
+    model_config = ConfigDict(**{**Part.model_config, "strict": False})
 
     design: Literal["lqg"] | None = None
     delay_ns: Duration | None = None

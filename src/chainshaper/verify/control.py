@@ -64,7 +64,8 @@ class ControlledRecording:
     @property
     def came_ns(self) -> NDArray[np.int64]:
         """The latencies of the outputs that came."""
-        return self.latencies_ns[self.latencies_ns != NEVER]
+        came: NDArray[np.int64] = self.latencies_ns[self.latencies_ns != NEVER]
+        return came
 
 
 @dataclass(frozen=True)
