@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from chainshaper.control.plant_file import load_loop as load_loop
     from chainshaper.control.steady_state import LatencyCosts as LatencyCosts
     from chainshaper.control.steady_state import cost_of_constant as cost_of_constant
-    from chainshaper.control.steady_state import delay_margin_s as delay_margin_s
+    from chainshaper.control.steady_state import stable_latencies as stable_latencies
     from chainshaper.enforcement.undoing import end_run as end_run
     from chainshaper.enforcement.undoing import find_runs as find_runs
     from chainshaper.flow.apply import apply_plan as apply_plan

@@ -3,8 +3,10 @@ against the steady state; and what is refused.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
+from importlib import import_module
+from typing import Any
 
-import control
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -36,12 +38,13 @@ from chainshaper.control.steady_state import (
     LatencyCosts,
     cost_of_constant,
     covariance_of_constant,
-    delay_margin_s,
     radius_of_constant,
+    stable_latencies,
     steady_period,
 )
 from chainshaper.values.errors import InputError
 
+control: Any = import_module("control")  # python-control, not the folder that this file is in
 MS = 1_000_000
 PERIOD = 100 * MS
 
@@ -189,8 +192,11 @@ def test_the_order_of_latencies_matters() -> None:
 
 def test_an_unstable_loop_is_reported_with_the_delay_from_which_on_it_is() -> None:
     loop = pendulum(0.0)
-    margin = delay_margin_s(loop)
-    assert margin is not None
+    stable = stable_latencies(loop)
+    assert stable is not None
+    assert stable.until_s is not None
+    margin = stable.until_s
+    assert stable.from_s == 0
     assert radius_of_constant(loop, margin - 1e-4) < 1 < radius_of_constant(loop, margin + 1e-4)
     assert np.isfinite(cost_of_constant(loop, margin - 1e-3))
     assert cost_of_constant(loop, margin + 1e-3) == np.inf
@@ -202,10 +208,22 @@ def test_an_unstable_loop_is_reported_with_the_delay_from_which_on_it_is() -> No
     assert LatencyCosts(loop).cost(mostly_lost) == np.inf
 
 
-def test_a_stable_plant_has_no_delay_margin_where_the_gain_is_small() -> None:
+def test_loops_are_stable_with_any_latency_or_none_or_with_longer_ones_alone() -> None:
     problem = problem_of([1], [1, 1])
-    assert delay_margin_s(Loop(problem, static_controller([[0.2]]))) is None
-    assert delay_margin_s(Loop(problem, static_controller([[-2.0]]))) == 0.0
+    assert stable_latencies(Loop(problem, static_controller([[0.2]]))) == (0.0, None)
+    assert stable_latencies(Loop(problem, static_controller([[-2.0]]))) is None
+    # A controller without a price on its input counts on the delay that it was designed for.
+    fast = problem_of([1], [1, 0, -9])
+    cost = fast.cost.copy()
+    cost[2, 2] = 1e-6
+    fast = replace(fast, cost=cost, measurement_noise=np.array([[1e-6]]))
+    loop = Loop(fast, design_controller(fast, 0.086))
+    stable = stable_latencies(loop)
+    assert stable is not None
+    assert stable.until_s is not None
+    assert 0 < stable.from_s < 0.086 < stable.until_s
+    assert radius_of_constant(loop, stable.from_s - 1e-4) > 1
+    assert radius_of_constant(loop, stable.from_s + 1e-4) < 1
 
 
 def test_the_designed_controller_is_the_best() -> None:
@@ -296,7 +314,7 @@ def test_arrays_that_do_not_fit_are_refused_by_the_kernel() -> None:
     loop = pendulum()
     flows = Flows(loop.problem)
     rows, noise = sampling(loop)
-    right = {
+    right: dict[str, Any] = {
         "sizes": (1, 2, 3, 1),
         "longest_s": 0.1,
         "flows": flows.table.ravel(),

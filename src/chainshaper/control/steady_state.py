@@ -12,6 +12,7 @@ distribution from its averages, as a planner needs it that tries many.
 """
 
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,31 +141,50 @@ def covariance_of_constant(loop: Loop, latency_s: float, flows: Flows | None = N
     return before
 
 
-def delay_margin_s(loop: Loop, flows: Flows | None = None) -> float | None:
-    """Return the constant latency from which on the loop is unstable; None: none up to 20 periods.
+class StableLatencies(NamedTuple):
+    """The constant latencies, from the shortest on, with which a loop is stable (s)."""
 
-    It is 0 where the loop is unstable without a latency.
+    from_s: float  # 0, but for a controller that counts on a delay
+    until_s: float | None  # the delay margin; None: beyond 20 periods
+
+    @property
+    def text(self) -> str:
+        """``stable with constant latencies from 0 ms to 81 ms``."""
+        first = duration_text(round(self.from_s * 1e6) * 1_000)
+        if self.until_s is None:
+            return f"stable with constant latencies from {first} on, to {MOST_PERIODS} periods"
+        last = duration_text(round(self.until_s * 1e6) * 1_000)
+        return f"stable with constant latencies from {first} to {last}"
+
+
+def stable_latencies(loop: Loop, flows: Flows | None = None) -> StableLatencies | None:
+    """Return the first range of constant latencies with which a loop is stable; None: with none.
+
+    It is looked for in steps of a twentieth of the period, and then to a ten-millionth.
     """
     flows = flows or Flows(loop.problem)
     period = loop.problem.period_s
-    stable = 0.0
-    for step in range(MOST_PERIODS * 20 + 1):
-        latency = step * period / 20
-        if radius_of_constant(loop, latency, flows) >= STABLE:
-            break
-        stable = latency
-    else:
-        return None
-    if not step:
-        return 0.0
-    unstable = latency
-    while unstable - stable > 1e-7 * period:
-        middle = (stable + unstable) / 2
-        if radius_of_constant(loop, middle, flows) >= STABLE:
-            unstable = middle
-        else:
-            stable = middle
-    return unstable
+
+    def is_stable(latency: float) -> bool:
+        return radius_of_constant(loop, latency, flows) < STABLE
+
+    def change(before: float, behind: float) -> float:
+        """Halve the interval in which the loop becomes stable, or unstable."""
+        at_first = is_stable(before)
+        while behind - before > 1e-7 * period:
+            middle = (before + behind) / 2
+            before, behind = (middle, behind) if is_stable(middle) == at_first else (before, middle)
+        return behind
+
+    begins = 0.0 if is_stable(0.0) else None
+    for step in range(1, MOST_PERIODS * 20 + 1):
+        before, latency = (step - 1) * period / 20, step * period / 20
+        if is_stable(latency) == (begins is not None):
+            continue
+        if begins is not None:
+            return StableLatencies(begins, change(before, latency))
+        begins = change(before, latency)
+    return None if begins is None else StableLatencies(begins, None)
 
 
 class LatencyCosts:

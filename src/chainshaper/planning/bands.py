@@ -503,7 +503,10 @@ def broken_constraint(problem: BandProblem, slot_ends_ns: Sequence[int]) -> str 
 def violation_ns(problem: BandProblem, ends_ns: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return by how much (ns) each row of slot ends breaks the constraints; 0: it is allowed."""
     off = [off_ns for _, off_ns in _broken(problem, ends_ns)]
-    return np.sum([np.broadcast_to(amount, (len(ends_ns),)) for amount in off], axis=0)
+    total = np.zeros(len(ends_ns))
+    for amount in off:
+        total += amount
+    return total
 
 
 def _broken(

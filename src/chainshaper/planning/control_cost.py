@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from chainshaper.control.loop import Loop
 from chainshaper.control.plant_file import LoopDescription, load_loop
-from chainshaper.control.steady_state import LatencyCosts, cost_of_constant, delay_margin_s
+from chainshaper.control.steady_state import LatencyCosts, cost_of_constant, stable_latencies
 from chainshaper.planning.bands import (
     BandProblem,
     band_problem,
@@ -258,9 +258,8 @@ def _finite(cost: float) -> float | None:
 
 
 def _unstable(loop: Loop, plant: str, start_ns: int) -> str:
-    margin = delay_margin_s(loop)
-    bound = "without any delay" if not margin else f"from {duration_text(round(margin * 1e9))} on"
-    if margin is None:
-        bound = "with these latencies"
-    reason = f"{plant}: the loop is unstable {bound}, and the slot is at {duration_text(start_ns)}"
-    return f"{reason}: design the controller for a longer delay (--redesign), or shorten the chain"
+    stable = stable_latencies(loop)
+    known = "unstable with every constant latency" if stable is None else stable.text
+    reason = f"{plant}: the loop is unstable with any slots, of which the last begins at"
+    reason += f" {duration_text(start_ns)}; it is {known}"
+    return f"{reason}: let the controller be designed for the delay (--redesign), or correct it"

@@ -57,11 +57,8 @@ def control_table(costs: ControlCosts) -> ResultTable:
 
 
 def _margin_text(costs: ControlCosts) -> str:
-    if costs.margin_s is None:
-        return "stable with any constant latency up to 20 periods"
-    if not costs.margin_s:
-        return "unstable without any latency"
-    return f"unstable from a constant latency of {duration_text(round(costs.margin_s * 1e9))} on"
+    unstable = "unstable with every constant latency"
+    return unstable if costs.stable is None else costs.stable.text
 
 
 def verdict(costs: ControlCosts) -> str | None:
@@ -124,11 +121,18 @@ def control_json(costs: ControlCosts) -> dict[str, Any]:
         "format": JSON_FORMAT,
         "plant": str(costs.description.path),
         "period_ns": costs.period_ns,
-        "delay_margin_ns": None if costs.margin_s is None else round(costs.margin_s * 1e9),
+        "stable_latencies_ns": _range_ns(costs),
         "recordings": [_recording_json(recording) for recording in costs.recordings],
         "modes": None if costs.modes is None else modes_json(costs.modes),
         "notes": list(costs.notes),
     }
+
+
+def _range_ns(costs: ControlCosts) -> list[int | None] | None:
+    """Return the constant latencies with which the loop is stable: from, and until (null: all)."""
+    if costs.stable is None:
+        return None
+    return [None if edge is None else round(edge * 1e9) for edge in costs.stable]
 
 
 def _recording_json(recording: ControlledRecording) -> dict[str, Any]:

@@ -5,7 +5,7 @@ They show a recording (events, callbacks, chains, stalls), a machine (abilities,
 """
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import datetime, timezone
 from typing import TYPE_CHECKING, Any
 
@@ -711,7 +711,7 @@ def broken_table(broken: "Sequence[Judged]") -> ResultTable:
     columns = [*words("recording", "where", "limit"), *figures("budget", "found")]
     table = ResultTable("Limits that are broken", [*columns, *words("because")])
     for judged in broken:
-        shown = percent if judged.is_share else ms
+        shown: Callable[[float | None], str] = percent if judged.is_share else ms
         if judged.is_cost:
             shown = cost_text
         values = shown(judged.limit), shown(judged.measured)

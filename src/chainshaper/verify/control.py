@@ -16,9 +16,10 @@ from chainshaper.control.modes import ModeCosts, mode_costs
 from chainshaper.control.plant_file import LoopDescription, load_loop
 from chainshaper.control.steady_state import (
     LatencyCosts,
+    StableLatencies,
     cost_of_constant,
     covariance_of_constant,
-    delay_margin_s,
+    stable_latencies,
 )
 from chainshaper.planning import Plan
 from chainshaper.planning.latencies import read_latencies
@@ -75,7 +76,7 @@ class ControlCosts:
     description: LoopDescription
     loop: Loop
     period_ns: int
-    margin_s: float | None  # the constant latency from which on it is unstable
+    stable: StableLatencies | None  # with these constant latencies; None: with none
     recordings: tuple[ControlledRecording, ...]
     modes: ModeCosts | None
     notes: tuple[str, ...]
@@ -166,7 +167,7 @@ def _costs(
         description=description,
         loop=loop,
         period_ns=period_ns,
-        margin_s=delay_margin_s(loop, flows),
+        stable=stable_latencies(loop, flows),
         recordings=tuple(controlled),
         modes=modes,
         notes=(*loop.problem.doubts, *_under_way(controlled, period_ns)),
