@@ -37,7 +37,9 @@ def test_a_transfer_function_and_its_state_space_are_one_loop(tmp_path: Path) ->
     space = load_loop(written(tmp_path, (FUNCTION, STATES))).loop()
     assert function.problem.plant.states == space.problem.plant.states == 2
     for latency in (0.0, 0.02, 0.15):
-        assert cost_of_constant(function, latency) == pytest.approx(cost_of_constant(space, latency))
+        assert cost_of_constant(function, latency) == pytest.approx(
+            cost_of_constant(space, latency)
+        )
 
 
 def test_costs_and_noises_are_numbers_diagonals_or_matrices(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Slots that cost a controller least: against trying out every placement, and what is said of it."""
+"""Slots that cost a controller least: against every placement, and what is said of them."""
 
 from itertools import combinations
 from pathlib import Path
@@ -62,9 +62,7 @@ def test_no_placement_on_the_grid_costs_less(
     bands: int, delay: str, seed: int, into_open_slot: IntoOpenSlot, tmp_path: Path
 ) -> None:
     file, sample = plant(tmp_path, delay), latencies(60, seed)
-    plan = planned(
-        sample, bands=bands, plant=file, grid_ns=2 * MS, into_open_slot=into_open_slot
-    )
+    plan = planned(sample, bands=bands, plant=file, grid_ns=2 * MS, into_open_slot=into_open_slot)
     costs = LatencyCosts(load_loop(file).loop(100 * MS))
     last = publish_slots(plan)[-1][1]
     at_once = into_open_slot == "at-once"

@@ -30,13 +30,14 @@ def _finite(cost: float | None) -> float | None:
 
 def control_table(costs: ControlCosts) -> ResultTable:
     """Make the table of recordings: latency, jitter, cost, and costs of constant latencies."""
-    constants = [f"all at p{constant.percentile:g}" for constant in costs.recordings[0].constants]
+    constants = [f"at p{constant.percentile:g}" for constant in costs.recordings[0].constants]
     constants = [name.replace("p100", "maximum") for name in constants]
     columns = [*words("recording"), *figures("cycles", "lost", "average", "jitter", "cost", "±")]
     columns += figures(*constants)
     table = ResultTable(f"Cost of the control loop {costs.description.path.name}", columns)
     table.caption = (
-        f"cost per second; redesigned: with the controller for that constant latency;\n"
+        f"cost per second; at p50: with all latencies constant, there; redesigned: with the"
+        f" controller for it;\n"
         f"{_margin_text(costs)}; times in ms"
     )
     for recording in costs.recordings:
@@ -52,7 +53,7 @@ def control_table(costs: ControlCosts) -> ResultTable:
             *(cost_text(constant.cost) for constant in recording.constants),
         )
         redesigned = [cost_text(constant.redesigned) for constant in recording.constants]
-        table.add("  redesigned", *[""] * 6, *redesigned)
+        table.add("redesigned", *[""] * 6, *redesigned)
     return table
 
 
