@@ -1,5 +1,3 @@
-#include "control/propagation.hpp"
-
 #include <nanobind/stl/tuple.h>
 
 #include <cmath>
@@ -7,6 +5,7 @@
 #include <tuple>
 
 #include "bindings/arrays.hpp"
+#include "control/propagation.hpp"
 
 namespace chainshaper::bindings {
 namespace {

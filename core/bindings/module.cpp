@@ -17,7 +17,8 @@ NB_MODULE(_core, module) {
   // When the interpreter ends, notebooks, debuggers and test runners may still hold results. That
   // is no fault of theirs, and users read nanobind's list of these objects as an error.
   nanobind::set_leak_warnings(false);
-  module.doc() = "The native library (C++): trace decoder, joins, band placement, simulator,"
+  module.doc() =
+      "The native library (C++): trace decoder, joins, band placement, simulator,"
       " covariances of control loops.";
   chainshaper::bindings::bind_bands(module);
   chainshaper::bindings::bind_columns(module);

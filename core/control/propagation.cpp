@@ -10,10 +10,10 @@ namespace {
 class Covariance {
 public:
   Covariance(std::size_t size, std::span<const double> values)
-  : size_(size), entries_(values.begin(), values.end()), fresh_(size * size) {}
+      : size_(size), entries_(values.begin(), values.end()), fresh_(size * size) {}
 
-  // Replaces rows (and columns) from `first` on: new row r is the sum of weights[r, c] times the old
-  // row `from` + c; their covariance gains `noise`, which may be null.
+  // Replaces rows (and columns) from `first` on: new row r is the sum of weights[r, c] times the
+  // old row `from` + c; their covariance gains `noise`, which may be null.
   void replace(std::size_t first, std::size_t rows, std::size_t from, std::size_t columns,
                const double * weights, const double * noise, std::size_t noise_stride) {
     for (std::size_t row = 0; row < rows; ++row) {
@@ -93,9 +93,10 @@ public:
     const std::size_t count = values_.size();
     const double * terms = flows_.coefficients.data() + interval * 4 * count;
     for (std::size_t value = 0; value < count; ++value)
-      values_[value] = terms[value] + inside * (terms[count + value] +
-                                                inside * (terms[2 * count + value] +
-                                                          inside * terms[3 * count + value]));
+      values_[value] =
+          terms[value] +
+          inside * (terms[count + value] +
+                    inside * (terms[2 * count + value] + inside * terms[3 * count + value]));
     return values_.data();
   }
 
@@ -135,7 +136,10 @@ Propagated propagate(const Sizes & sizes, const Flows & flows, const Sampling & 
   };
   for (std::size_t event = 0; event < waits_s.size(); ++event) {
     double left_s = waits_s[event];
-    for (; left_s > flows.longest_s; left_s -= flows.longest_s) flow(flows.longest_s);
+    while (left_s > flows.longest_s) {
+      flow(flows.longest_s);
+      left_s -= flows.longest_s;
+    }
     if (left_s > 0.0) flow(left_s);
     const std::int32_t slot = slots[event];
     if (slot == nothing) continue;
