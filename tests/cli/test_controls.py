@@ -132,7 +132,15 @@ def test_without_scipy_it_says_what_to_install(
 
 
 def test_a_plan_shows_what_it_chose_from(plant: Path, latencies: Path) -> None:
-    plan = ["plan", "--latencies", latencies, "--period", "100ms", "--plant", plant]
+    plan: list[str | Path] = [
+        "plan",
+        "--latencies",
+        latencies,
+        "--period",
+        "100ms",
+        "--plant",
+        plant,
+    ]
     plan += ["--grid", "1ms"]
     values = json_of(*plan)
     assert values["control"]["chosen"] in values["control"]["alternatives"]
