@@ -31,6 +31,17 @@ if TYPE_CHECKING:
     from chainshaper.analysis import find_chain as find_chain
     from chainshaper.analysis import load_named_paths as load_named_paths
     from chainshaper.analysis.graph import ApplicationDescription as ApplicationDescription
+    from chainshaper.control.costs import cost_over as cost_over
+    from chainshaper.control.design import design_controller as design_controller
+    from chainshaper.control.loop import Controller as Controller
+    from chainshaper.control.loop import Loop as Loop
+    from chainshaper.control.loop import Plant as Plant
+    from chainshaper.control.loop import Problem as Problem
+    from chainshaper.control.loop import plant_of as plant_of
+    from chainshaper.control.plant_file import load_loop as load_loop
+    from chainshaper.control.steady_state import LatencyCosts as LatencyCosts
+    from chainshaper.control.steady_state import cost_of_constant as cost_of_constant
+    from chainshaper.control.steady_state import stable_latencies as stable_latencies
     from chainshaper.enforcement.undoing import end_run as end_run
     from chainshaper.enforcement.undoing import find_runs as find_runs
     from chainshaper.flow.apply import apply_plan as apply_plan
@@ -87,6 +98,11 @@ if TYPE_CHECKING:
     from chainshaper.values.recording import Recording as Recording
     from chainshaper.values.recording import event_counts as event_counts
     from chainshaper.values.recording import open_recording as open_recording
+    from chainshaper.verify.control import ControlCosts as ControlCosts
+    from chainshaper.verify.control import control_costs as control_costs
+    from chainshaper.verify.control import (
+        control_costs_of_latencies as control_costs_of_latencies,
+    )
     from chainshaper.verify.measure import Comparison as Comparison
     from chainshaper.verify.measure import Measurement as Measurement
     from chainshaper.verify.measure import compare_chains as compare_chains

@@ -29,6 +29,33 @@ def add_band(
     and for places or windows that do not ascend.
     """
 
+# Control loops
+
+NO_EVENT: int
+"""In place of a slot: time passes, and nothing happens."""
+
+def propagate_covariance(
+    *,
+    sizes: tuple[int, int, int, int],
+    longest_s: float,
+    flows: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    noise: NDArray[np.float64],
+    waits_s: NDArray[np.float64],
+    slots: NDArray[np.int32],
+    covariance: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Carry the covariance of a control loop over events (:mod:`chainshaper.control.costs`).
+
+    ``sizes`` are the numbers of inputs, of states of the plant and of the controller, and of slots.
+    ``flows`` are :attr:`.Flows.table`, flat; ``rows`` and ``noise`` what a sample does. Before each
+    event ``waits_s`` pass; its entry in ``slots`` is ~slot for a sample that computes into it, slot
+    for an output that arrives from it, or :data:`NO_EVENT`. Returns the cost and the duration (s)
+    from each sample to the next, and the covariance behind the last event.
+
+    Raises ValueError for arrays of wrong lengths, and for events that do not follow each other.
+    """
+
 # Joins: rows of one table matched to rows of another by key and time
 
 _KeyColumn = NDArray[np.int64] | NDArray[np.uint64] | NDArray[np.int32] | NDArray[np.uint32]

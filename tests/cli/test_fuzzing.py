@@ -273,9 +273,38 @@ def limits_and_paths(chance: random.Random, folder: Path, recording: Recording) 
     return ("latency", recording.path, "--chains", file)
 
 
+LOOP = """format: 1
+plant: {state_space: {A: [[0, 1], [1, 0]], B: [[0], [1]], C: [[1, 0]]}}
+noise: {process: 1, measurement: [0.01]}
+cost: {output: 1, input: 0.01}
+period: 100ms
+controller: {design: lqg, delay: 20ms}
+modes: {city: 30ms, highway: 60ms}
+"""
+
+
+def control_loops(chance: random.Random, folder: Path, recording: Recording) -> Arguments:
+    """The description of a control loop."""
+    text = LOOP
+    if chance.random() < 0.5:
+        text = text.replace(
+            "A: [[0, 1], [1, 0]], B: [[0], [1]], C: [[1, 0]]",
+            "numerator: [1], denominator: [1, 0, -1]",
+        )
+        text = text.replace("state_space", "transfer_function")
+    if chance.random() < 0.3:
+        text = text.replace("{design: lqg, delay: 20ms}", "{gains: [[3.5]]}")
+    file = _write_damaged(chance, folder / "plant.yaml", text)
+    sample = folder / "latencies.txt"
+    sample.write_text("".join(f"{30 + number % 50}ms\n" for number in range(60)))
+    if chance.random() < 0.5:
+        return ("control", file, "--latencies", sample)
+    return ("plan", "--latencies", sample, "--period", "100ms", "--plant", file, "--grid", "1ms")
+
+
 KINDS: tuple[Callable[..., Arguments], ...] = (
     bytes_of_tables, columns_of_tables, facts_of_recordings, traces, applications, plans, axes,
-    latencies, limits_and_paths,
+    latencies, limits_and_paths, control_loops,
 )  # fmt: skip
 
 

@@ -144,7 +144,7 @@ def test_cycles_beyond_the_axis_are_marked_at_its_end(
 ) -> None:
     """Cycle 3 took 31 ms; were all others 20 ms, the axis would end at 23 ms."""
     drawn: list[Any] = []
-    monkeypatch.setattr(figures, "_save_figure", lambda figure, _: drawn.append(figure))
+    monkeypatch.setattr(figures, "save_figure", lambda figure, _: drawn.append(figure))
     measured = measure_latency(known_run(tmp_path / "known", 4, overran=(3,)))
     draw_latency([measured], "")
     assert "beyond" not in drawn[0].axes[0].get_xlabel()

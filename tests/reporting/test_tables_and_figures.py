@@ -109,7 +109,7 @@ def test_publish_slots_are_shaded_where_outputs_leave(
 ) -> None:
     """Under LET in the slot [30 ms, 31 ms) of the next cycle, 100 ms later."""
     drawn: list[Any] = []
-    monkeypatch.setattr(figures, "_save_figure", lambda figure, _: drawn.append(figure))
+    monkeypatch.setattr(figures, "save_figure", lambda figure, _: drawn.append(figure))
     let = known_plan().model_copy(update={"policy": "let-per-chain"})
     draw_distribution([replace(measure_latency(known_run(tmp_path / "known")), plan=let)], "")
     (slot,) = drawn[0].axes[0].patches

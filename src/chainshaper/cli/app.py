@@ -25,7 +25,7 @@ GROUPS = {
     "Look": "info graph chains callbacks latency report export threads watch",
     "Plan": "plan offsets sweep",
     "Shape": "shape splice apply status release",
-    "Judge": "compare budget check",
+    "Judge": "compare control budget check",
 }
 """The verbs in the order in which `--help` lists them, by what a user wants to do."""
 
@@ -34,6 +34,7 @@ _MODULES = {
     "plans": "plan offsets sweep splice",
     "traces": "info describe graph callbacks chains latency convert compare budget check report"
     " export",
+    "controls": "control",
     "applying": "threads apply status release doctor",
 }
 VERBS = {verb: module for module, verbs in _MODULES.items() for verb in verbs.split()}

@@ -107,7 +107,7 @@ def plan(
     with out.late_progress("plan") as report:
         report(0.5, "planning")
         chain_plan = cs.plan_chain(planned[0], request, sinks)
-        if request.bands == "auto":
+        if request.bands == "auto" and request.plant is None:
             report(0.8, "choosing the number of bands")
             choice = planning.band_choice(chain_plan, planned[0], request, sinks)
     if output is not None:
@@ -157,6 +157,12 @@ def _print_plan(
     if choice is not None:
         values["choice"] = overviews.choice_json(choice)
         tables.append(overviews.choice_table(choice))
+    if chain_plan.control is not None:
+        from chainshaper.reporting import control as of_control
+
+        tables.append(of_control.choice_table(chain_plan.control))
+        warnings = [*of_control.choice_notes(chain_plan.control), *warnings]
+        values["warnings"] = [*warnings]
     as_tables = out.present(json, values, *tables)
     if as_tables:
         out.notes(warnings)
@@ -278,6 +284,9 @@ def sweep(
     plan: Path | None = opt.argument(
         "plan.yaml", "A plan that is in force at all points. Default: each is planned."
     ),
+    plant: Path | None = opt.option(
+        "--plant PLANT.yaml", "Also compute what the latencies cost this control loop."
+    ),
     cycles: int = opt.option("--cycles", "Cycles to plan from, and to judge by.", 100_000, min=1),
     seed: int | None = opt.SEED,
     workers: int | None = opt.option(
@@ -316,6 +325,7 @@ def sweep(
                 seed=seed,
                 workers=workers,
                 scheduler=scheduler,
+                plant=plant,
                 progress=report,
             )
     except KeyboardInterrupt:

@@ -37,6 +37,8 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from chainshaper.analysis import latency_statistics
 from chainshaper.analysis.latency import PERCENTILES
+from chainshaper.control.costs import NEVER, cost_over
+from chainshaper.control.plant_file import LoopDescription, load_loop
 from chainshaper.flow.plan import profile_chains
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.planning import ChainPlan, Plan, PlanRequest, Profile, plan_chain
@@ -90,6 +92,7 @@ FIGURES: dict[str, Any] = {
     **dict.fromkeys(("count", "incomplete", "late", "missed", "most_missed", *_OF_RUN), pl.Int64),
     **{f"p{percentile:g}_ns": pl.Int64 for percentile in PERCENTILES},
     "kept": pl.Boolean,
+    "control_cost": pl.Float64,
     "band_jitter_ns": pl.Int64,
     "per_band": pl.List(pl.Struct(_BAND)),
     "error": pl.String,
@@ -105,6 +108,8 @@ FIGURES: dict[str, Any] = {
     missed: both.
     most_missed: so many at most, as the plan promises.
     kept: whether it is so (:class:`~chainshaper.verify.promises.OutputsDue`).
+    control_cost: what the latencies cost a plant's controller per second; null: no plant is given,
+    or the loop is unstable.
     band_jitter_ns: the widest of those ``per_band``.
     per_band: slot, shares and jitter of each band.
     error: why the point could not be judged.
@@ -120,6 +125,7 @@ class Grid:
     plan: ChainPlan | None
     axes: Mapping[str, tuple[Any, ...]]
     cycles: int
+    plant: LoopDescription | None = None  # whose controller's cost is a figure
 
 
 def sweep(
@@ -132,6 +138,7 @@ def sweep(
     seed: int | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
+    plant: str | Path | None = None,
     progress: Progress = lambda *_: None,
 ) -> pl.DataFrame:
     """Simulate an application at every combination of some values, planned and shaped for each.
@@ -139,7 +146,8 @@ def sweep(
     ``vary`` has the values of each axis, durations as texts. With a ``plan``, this one is in force
     everywhere. Each point is a run of ``cycles`` periods to plan from, and another one with the
     plan in force; ``seed`` replaces the description's. ``workers`` threads compute (default: one
-    per core that we may use), or the Dask cluster whose ``scheduler`` is at that address.
+    per core that we may use), or the Dask cluster whose ``scheduler`` is at that address. Of a
+    ``plant``, the file that describes a control loop, the cost is a figure.
 
     The frame, also written to ``output`` (Parquet), has a row for each point, in the order of the
     axes: their columns (durations in ns, with ``_ns`` behind the name), ``cycles``, ``seed``, and
@@ -154,6 +162,10 @@ def sweep(
     output = new_file(output, (".parquet",))
     of_chain = None if plan is None else plan.chains[0]
     grid = grid_of(application, vary, of_chain, cycles=cycles, seed=seed)
+    described = None
+    if plant is not None:
+        described = Path(plant)
+        grid = dataclasses.replace(grid, plant=load_loop(described))
     if workers is not None and workers < 1:
         raise InputError(f"{workers} workers compute nothing: ask for at least 1")
     points = points_of(grid)
@@ -165,6 +177,8 @@ def sweep(
         "the axes": {name: list(values) for name, values in grid.axes.items()},
         "the number of cycles": grid.cycles,
     }
+    if described is not None:
+        about["the plant"] = described.read_text(encoding="utf-8")
     with finished_rows(rows_file, about) as (rows, add):
         missing = [(number, values) for number, values in enumerate(points) if number not in rows]
         if missing:
@@ -490,9 +504,25 @@ def row_at(
         figures |= {f"p{name}_ns": value for name, value in measured.percentiles_ns.items()}
         if plan is not None:
             figures |= _judged(plan, complete, measured.incomplete)
+        planned_for = None if request is None else request.plant
+        described = grid.plant if planned_for is None else load_loop(planned_for)
+        if described is not None:
+            figures["control_cost"] = _control_cost(described, application, latencies)
     except ChainshaperError as error:
         figures["error"] = str(error)
     return {**figures, "seconds": round(time.perf_counter() - began, 6)}
+
+
+def _control_cost(
+    described: LoopDescription, application: Application, latencies_ns: Any
+) -> float | None:
+    """Return what latencies, a period apart, cost a control loop; None: it is unstable."""
+    _, timer = origin_timer(application)
+    period_ns = timer.period_ns or 0
+    latencies = np.where(latencies_ns < 0, NEVER, latencies_ns)
+    samples = np.arange(latencies.size, dtype=np.int64) * period_ns
+    cost = cost_over(described.loop(period_ns), samples, latencies).cost
+    return cost if np.isfinite(cost) else None
 
 
 def _judged(plan: ChainPlan, latencies: Any, incomplete: int) -> dict[str, Any]:

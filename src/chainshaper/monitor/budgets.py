@@ -4,6 +4,7 @@
     through: [/command=/motor]
     chains:
       - {chain: /t1../t5, maximum: 80ms, percentiles: {'99': 75ms}, jitter: 40ms, missing: 1%,
+         control: {plant: plant.yaml, cost: 1.5},
          hops: [{topic: /t3, communication: 1ms, computation: 22ms}],
          age_at_loop: {minimum: 2ms, maximum: 14ms, percentiles: {'99': 12ms}, jitter: 10ms,
                        never: 1%, again: 55%}}
@@ -19,10 +20,12 @@ only these break is broken, and its message says so. ``missing`` is the share of
 late or never came; ``starts`` is the topic that starts a callback, or the declared period of its
 timer, as `chainshaper callbacks` shows it. ``age_at_loop`` is about the data of the chain's last
 loop, over all of its cycles; ``never`` and ``again`` are shares of the messages: used in no cycle,
-and in several. ``overruns`` is a share of a loop's instances. ``minimum`` and ``shortest_period``
-are the least that is allowed, all others the most.
+and in several. ``control`` limits what the latencies cost a control loop per second; the path of its
+description is relative to the budget file. ``overruns`` is a share of a loop's instances.
+``minimum`` and ``shortest_period`` are the least that is allowed, all others the most.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,14 +48,16 @@ from chainshaper.analysis.latency import (
     longest_times,
 )
 from chainshaper.analysis.loop_rates import LoopRate, loop_instances, loop_label, loop_rates
+from chainshaper.control.plant_file import load_loop
 from chainshaper.sources import open_source, with_declared
 from chainshaper.values.durations import duration_text
-from chainshaper.values.errors import ChainshaperError, InputError, shown
+from chainshaper.values.errors import ChainshaperError, InputError, OperationError, shown
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.handed_over import HandedOver, parse_through, through_texts
 from chainshaper.values.many_tasks import computed
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import AS_YAML, Part, PositiveDuration, read_model
+from chainshaper.verify.control import control_costs
 from chainshaper.verify.measure import PARTS, chain_of, hop_breakdown, measure_latency
 from chainshaper.verify.promises import OutputsDue, outputs_due, undisturbed_outputs_due
 
@@ -64,6 +69,7 @@ ROOM = 0.1  # a proposed limit is so much above what was measured (a share of it
 GRAIN_NS = 10_000  # proposed limits are whole multiples of it
 LEAST_MISSING = 0.01  # the lowest limit that is proposed for a share
 SHARES = ("missing", "overruns", "never used", "used again")  # figures that are no times
+COST = "control cost"
 EVENTS = "its events"  # what cannot be measured of a recording that cannot be read
 
 
@@ -107,6 +113,13 @@ class AgeBudget(Part):
     again: Share | None = None  # of the messages: used in several cycles
 
 
+class ControlBudget(Part):
+    """What the chain's latencies may cost a control loop per second."""
+
+    plant: str  # the description of the loop
+    cost: float = Field(gt=0, strict=False)
+
+
 class ChainBudget(Part):
     """The limits of a chain's latency."""
 
@@ -117,6 +130,7 @@ class ChainBudget(Part):
     missing: Share | None = None
     hops: tuple[HopBudget, ...] = Field(default=(), strict=False)
     age_at_loop: AgeBudget | None = None
+    control: ControlBudget | None = None
 
 
 class CallbackBudget(Part):
@@ -168,7 +182,10 @@ class Budget(Part):
 
 @dataclass(frozen=True)
 class Judged:
-    """One limit, and the figure of one recording beside it: ns, or a share (:data:`SHARES`)."""
+    """One limit, and the figure of one recording beside it.
+
+    It is in ns, or a share (:data:`SHARES`), or a cost per second (:data:`COST`).
+    """
 
     recording: str
     where: str  # the chain, or the callback
@@ -201,7 +218,14 @@ class Judged:
         return line if self.because is None else f"{line}; {self.because}"
 
     def _value(self, value: float) -> str:
+        if self.is_cost:
+            return f"{value:.4g}"
         return f"{value:.2%}" if self.is_share else duration_text(round(value))
+
+    @property
+    def is_cost(self) -> bool:
+        """Whether the figure is a cost per second, not a time."""
+        return self.figure == COST
 
     @property
     def is_share(self) -> bool:
@@ -214,7 +238,14 @@ def load_budget(path: str | Path) -> Budget:
     budget = read_model(path, Budget, made_by="written by `chainshaper budget`")
     if not (budget.chains or budget.callbacks or budget.loops):
         raise InputError(f"{path} has no limits: `chainshaper budget REC -o FILE` proposes some")
-    return budget
+    chains = []
+    for chain in budget.chains:
+        if (control := chain.control) is not None:
+            plant = str(Path(path).parent / control.plant)
+            load_loop(plant)  # what is wrong in it is no recording's fault
+            control = control.model_copy(update={"plant": plant})
+        chains.append(chain.model_copy(update={"control": control}))
+    return budget.model_copy(update={"chains": tuple(chains)})
 
 
 def save_budget(budget: Budget, path: str | Path) -> Path:
@@ -336,6 +367,8 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
             for figure, limit, measured in _chain_limits(chain, None, None):
                 judged.append(Judged(name, chain.chain, figure, limit, measured, because=reason))
             judged += _judged_age(name, chain, None, None, reason)
+            if (control := chain.control) is not None:
+                judged.append(Judged(name, chain.chain, COST, control.cost, None, because=reason))
             continue
         parts = hop_breakdown(analysis)
         hops = list(_judged_hops(name, chain, _longest_parts(parts)))
@@ -348,6 +381,7 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
             judged.append(verdict if verdict.met else replace(verdict, because=because))
         judged += hops
         judged += _judged_ages_of(name, chain, analysis.data_age)
+        judged += _judged_control(name, chain, recording)
     judged += _judged_callbacks(name, budget.callbacks, longest_times(flow))
     rates = loop_rates(loop_instances(flow)) if budget.loops else []
     return [*judged, *_judged_loops(name, budget.loops, rates)]
@@ -534,6 +568,23 @@ def _judged_age(
             because, where = reason if measured is None else None, f"{chain.chain} at its loop"
             at_least = figure == "lowest age"
             yield Judged(name, where, figure, most, measured, None, because, at_least)
+
+
+def _judged_control(name: str, chain: ChainBudget, recording: Recording) -> Iterator[Judged]:
+    """Judge the limit of what a recording's latencies cost a control loop."""
+    if chain.control is None:
+        return
+    limit, measured, because = chain.control.cost, None, None
+    try:
+        costs = control_costs(chain.control.plant, [recording], chain.chain)
+        cost = costs.recordings[0].sequence.cost
+        if math.isfinite(cost):
+            measured = cost
+        else:
+            because = "the control loop is unstable with these latencies"
+    except (InputError, OperationError) as error:
+        because = str(error)
+    yield Judged(name, chain.chain, COST, limit, measured, because=because)
 
 
 def _judged_loops(

@@ -191,7 +191,7 @@ def with_bands(
 
     Raises OperationError: no such placement exists; the message names the constraint.
     """
-    problem = _problem(plan, latencies_ns, grid_ns, max_gap_ns, max_share)
+    problem = band_problem(plan, latencies_ns, grid_ns, max_gap_ns, max_share)
     has_other_goal = minimise != "mean" or mean_at_most_ns is not None
     if has_other_goal and (bands == "auto" or solver != "exact"):
         raise InputError("another goal than the average needs the exact solver and fixed bands")
@@ -205,9 +205,25 @@ def with_bands(
         placement = place_by_swarm(problem, bands, seed)
     else:
         placement = place_randomly(problem, bands, seed)
-    length, ends = problem.publish_slot_ns, placement.slot_ends_ns
     most = latencies_ns if most_ns is None else most_ns
-    latest = predict_bands(most, ends, length, plan.into_open_slot)
+    return with_slots_ending_at(
+        plan, latencies_ns, most, placement.slot_ends_ns, problem.publish_slot_ns
+    )
+
+
+def with_slots_ending_at(
+    plan: ChainPlan,
+    latencies_ns: NDArray[np.int64],
+    most_ns: NDArray[np.int64],
+    slot_ends_ns: Sequence[int],
+    publish_slot_ns: int,
+) -> ChainPlan:
+    """Return a shaped plan with these publish slots, and what they make of the latencies.
+
+    ``most_ns`` as for :func:`with_bands`.
+    """
+    length, ends = publish_slot_ns, slot_ends_ns
+    latest = predict_bands(most_ns, ends, length, plan.into_open_slot)
     likely = predict_bands(latencies_ns, ends, length, plan.into_open_slot)
     predicted = likely.model_copy(update={"mean_ns": latest.mean_ns})
     return with_publish_slots(plan, [(end - length, end) for end in ends], predicted=predicted)
@@ -226,7 +242,7 @@ def choose_bands(
 
     It is the first with which another band takes less than ``least_gain`` off the average.
     """
-    return _choose(_problem(plan, latencies_ns, grid_ns, max_gap_ns, max_share), least_gain)
+    return _choose(band_problem(plan, latencies_ns, grid_ns, max_gap_ns, max_share), least_gain)
 
 
 def _choose(problem: BandProblem, least_gain: float) -> BandChoice:
@@ -265,7 +281,7 @@ def with_long_slot(
     return with_publish_slots(plan, slots, predicted=predicted, policy="one-long-slot")
 
 
-def _problem(
+def band_problem(
     plan: ChainPlan,
     latencies_ns: NDArray[np.int64],
     grid_ns: int,
@@ -482,6 +498,15 @@ def broken_constraint(problem: BandProblem, slot_ends_ns: Sequence[int]) -> str 
     """
     broken = _broken(problem, np.array(slot_ends_ns))
     return next((words for words, off in broken if off > 0), None)
+
+
+def violation_ns(problem: BandProblem, ends_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return by how much (ns) each row of slot ends breaks the constraints; 0: it is allowed."""
+    off = [off_ns for _, off_ns in _broken(problem, ends_ns)]
+    total = np.zeros(len(ends_ns))
+    for amount in off:
+        total += amount
+    return total
 
 
 def _broken(

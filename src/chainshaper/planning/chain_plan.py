@@ -398,6 +398,18 @@ class Prediction(Part):
     receivers: "Prediction | None" = None
 
 
+class ControlCost(Part):
+    """What the plan's slots let a controller cost per second, and what was chosen from."""
+
+    plant: str  # the file that describes the loop
+    cost: float
+    unshaped: float | None  # the same without a plan; None: the loop is unstable
+    chosen: str  # the name of one of the alternatives
+    delay_ns: Duration | None = None  # that the controller is to be designed for; None: it stays
+    alternatives: dict[str, float | None] = Field(default_factory=dict)
+    worth: bool = True  # whether it costs less than unshaped
+
+
 class BandPrediction(NamedTuple):
     """What a plan promises of a latency band."""
 
@@ -434,6 +446,7 @@ class ChainPlan(Part):
     modes: Modes | None = None
     adaptation: Adaptation | None = None
     loop: PlannedLoop | None = None  # that reads the output; None: no loop of the chain does
+    control: ControlCost | None = None  # of the plant that the slots are placed for
     predicted: Prediction
 
     def __repr__(self) -> str:

@@ -571,6 +571,20 @@ def _margin(profile: Profile, request: PlanRequest) -> Margin:
 
 def _with_policy(plan: ChainPlan, profile: Profile, request: PlanRequest) -> ChainPlan:
     """Return the plan of the requested policy, made from a shaped one."""
+    if request.policy == "shaped" and request.plant is not None:
+        from chainshaper.planning.control_cost import with_least_cost
+
+        return with_least_cost(
+            plan,
+            profile,
+            plant=request.plant,
+            redesign=request.redesign,
+            bands=request.bands,
+            grid_ns=request.grid_ns,
+            max_gap_ns=request.max_gap_ns,
+            max_share=request.max_share,
+            mean_at_most_ns=request.mean_at_most_ns,
+        )
     if request.policy == "shaped":
         return with_bands(
             plan,
@@ -662,6 +676,11 @@ def refuse_contradictions(request: PlanRequest, *, sinks: bool, modes: bool) -> 
         reason = "nothing says which mode was in force while latencies were measured"
         raise InputError(f"{reason}: add --mode-profile MODE=REC, or say what `announces` them")
     margins.refuse_contradictory_margin(request)
+    if request.redesign and request.plant is None:
+        raise InputError("--redesign is about the controller of a plant: add --plant PLANT.yaml")
+    if request.plant is not None and (request.minimise != "mean" or request.solver != "exact"):
+        reason = "--plant minimises the cost of its control loop, and nothing else"
+        raise InputError(f"{reason}: leave out --minimise and --solver")
     if request.policy != "one-long-slot" and request.slot_start_ns is not None:
         raise InputError("a slot's start goes with the policy one-long-slot: add it")
     cores = request.cores or ()
@@ -680,7 +699,10 @@ def refuse_contradictions(request: PlanRequest, *, sinks: bool, modes: bool) -> 
 
 def _refuse_placement(request: PlanRequest, why: str) -> None:
     """Refuse the wishes for the placement of bands, where bands are not placed by them."""
-    for name in ("bands", "solver", "max_gap_ns", "max_share", "minimise", "mean_at_most_ns"):
+    for name in (
+        *("bands", "solver", "max_gap_ns", "max_share", "minimise", "mean_at_most_ns"),
+        *("plant", "redesign"),
+    ):
         if getattr(request, name) != getattr(_STANDARD, name):
             option = name.removesuffix("_ns").replace("_", "-")
             raise InputError(f"--{option} places latency bands, {why}")

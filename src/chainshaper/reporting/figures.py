@@ -87,7 +87,7 @@ def new_pictures(folder: str | Path, names: Iterable[str]) -> tuple[Path, ...]:
 
 
 @contextmanager
-def _user_style() -> Iterator[None]:
+def user_style() -> Iterator[None]:
     """Draw in the user's style of matplotlib, unless others may have written that file.
 
     The style of a program that calls this is not changed.
@@ -101,10 +101,10 @@ def _user_style() -> Iterator[None]:
         yield
 
 
-@_user_style()
+@user_style()
 def draw_latency(measurements: Sequence[Measurement], path: str | Path) -> Path:
     """Draw the latency of every cycle, all recordings in one picture (:func:`latency_figure`)."""
-    return _save_figure(latency_figure(measurements), path)
+    return save_figure(latency_figure(measurements), path)
 
 
 def latency_figure(measurements: Sequence[Measurement]) -> Any:
@@ -113,7 +113,7 @@ def latency_figure(measurements: Sequence[Measurement]) -> Any:
     Crosses mark cycles that the machine disturbed. The picture ends a little above the highest
     undisturbed cycle; triangles at its upper edge mark the cycles beyond.
     """
-    figure, axes = _new_figure()
+    figure, axes = new_figure()
     limit_ms = _limit_ms([measurement.analysis for measurement in measurements])
     beyond = False
     for measurement, colour in zip(measurements, cycle(COLOURS), strict=False):
@@ -148,7 +148,7 @@ def _mark_beyond(
     return True
 
 
-@_user_style()
+@user_style()
 def draw_hops(measurements: Sequence[Measurement], path: str | Path) -> Path:
     """Draw the latency of every cycle, stacked by hop, a panel for each recording.
 
@@ -158,14 +158,14 @@ def draw_hops(measurements: Sequence[Measurement], path: str | Path) -> Path:
     """
     analyses = [measurement.analysis for measurement in measurements]
     titles = [measurement.recording.path.name for measurement in measurements]
-    return _save_figure(hops_figure(analyses, titles), path)
+    return save_figure(hops_figure(analyses, titles), path)
 
 
 def hops_figure(analyses: Sequence[LatencyAnalysis], titles: Sequence[str]) -> Any:
     """Make the figure of :func:`draw_hops`, with a title for each analysis."""
     from matplotlib.patches import Patch
 
-    figure, _ = _new_figure(len(analyses))
+    figure, _ = new_figure(len(analyses))
     panels = figure.axes
     named = dict.fromkeys(name for analysis in analyses for name in hop_names(analysis))
     colours = dict(zip(named, cycle(COLOURS), strict=False))
@@ -197,10 +197,10 @@ def _stack(
         panel.set_xlabel("cycle (triangles: beyond the axis)")
 
 
-@_user_style()
+@user_style()
 def draw_distribution(measurements: Sequence[Measurement], path: str | Path) -> Path:
     """Draw the cumulative distribution of undisturbed latencies, with publish slots shaded."""
-    figure, axes = _new_figure()
+    figure, axes = new_figure()
     for measurement, colour in zip(measurements, cycle(COLOURS), strict=False):
         latency = np.sort(measurement.analysis.calm["latency_ns"].to_numpy()) / 1e6
         share = np.arange(1, len(latency) + 1) / max(1, len(latency))
@@ -211,7 +211,7 @@ def draw_distribution(measurements: Sequence[Measurement], path: str | Path) -> 
             in_legend = None if number else "publish slot"  # once
             axes.axvspan(start / 1e6, end / 1e6, color="0.8", zorder=0, label=in_legend)
     axes.set(xlabel="end-to-end latency [ms]", ylabel="share of cycles")
-    return _save_figure(_with_title(figure, axes, measurements, vertical=False), path)
+    return save_figure(_with_title(figure, axes, measurements, vertical=False), path)
 
 
 def _with_title(
@@ -237,7 +237,7 @@ def _limit_ms(analyses: Sequence[LatencyAnalysis]) -> float:
     return max(analysis.undisturbed.max_ns or 0 for analysis in analyses) / 1e6 * 1.15
 
 
-@_user_style()
+@user_style()
 def draw_curve(choice: BandChoice, path: str | Path) -> Path:
     """Draw the average latency over the number of bands (paper, figure 7); mark the chosen number.
 
@@ -245,7 +245,7 @@ def draw_curve(choice: BandChoice, path: str | Path) -> Path:
     cannot be written.
     """
     path = new_file(path, ENDINGS)
-    figure, axes = _new_figure()
+    figure, axes = new_figure()
     bands = [len(placement.slot_ends_ns) for placement in choice.curve]
     means = [placement.mean_ns / 1e6 for placement in choice.curve]
     axes.plot(bands, means, "o-", color=COLOURS[1], label="best placement")
@@ -261,10 +261,10 @@ def draw_curve(choice: BandChoice, path: str | Path) -> Path:
     axes.set_xticks(bands)
     axes.set(xlabel="number of latency bands", ylabel="average latency, eq. 5 [ms]")
     axes.legend(loc="upper right")
-    return _save_figure(figure, path)
+    return save_figure(figure, path)
 
 
-@_user_style()
+@user_style()
 def draw_sweep(frame: pl.DataFrame, path: Path) -> Path:
     """Draw average and jitter over the first axis, a line for each combination of the others.
 
@@ -272,7 +272,7 @@ def draw_sweep(frame: pl.DataFrame, path: Path) -> Path:
     """
     first, *further_axes = sweep_axes(frame)
     places = {value: place for place, value in enumerate(frame[first].unique(maintain_order=True))}
-    figure, panels = _new_figure(panels=2)
+    figure, panels = new_figure(panels=2)
     lines = frame.partition_by(further_axes, maintain_order=True) if further_axes else [frame]
     for points in lines[:MOST_LINES]:
         name = ", ".join(
@@ -290,10 +290,10 @@ def draw_sweep(frame: pl.DataFrame, path: Path) -> Path:
     if further_axes:
         more = f" (the first {MOST_LINES} of {len(lines)})" if len(lines) > MOST_LINES else ""
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", title=more)
-    return _save_figure(figure, path)
+    return save_figure(figure, path)
 
 
-def _new_figure(panels: int = 1) -> tuple[Any, Any]:
+def new_figure(panels: int = 1) -> tuple[Any, Any]:
     """Make a figure and its axes; if there are several panels, a sequence of axes."""
     from matplotlib.figure import Figure
 
@@ -304,7 +304,7 @@ def _new_figure(panels: int = 1) -> tuple[Any, Any]:
     return figure, axes
 
 
-def _save_figure(figure: Any, path: str | Path) -> Path:
+def save_figure(figure: Any, path: str | Path) -> Path:
     """Write a figure in the format that its file's ending names.
 
     Raises OperationError: it cannot be written.
@@ -326,7 +326,7 @@ def _painted(figure: Any, file_format: str | None) -> bytes:
     return picture.getvalue()
 
 
-@_user_style()
+@user_style()
 def png_of_figure(make: Callable[..., Any], *values: Any) -> bytes:
     """Paint the figure that ``make`` makes of ``values``, as PNG."""
     return _painted(make(*values), "png")
@@ -334,7 +334,7 @@ def png_of_figure(make: Callable[..., Any], *values: Any) -> bytes:
 
 def plan_figure(plan: ChainPlan) -> Any:
     """Make the figure of a plan: the slots of each server over one cycle."""
-    figure, axes = _new_figure()
+    figure, axes = new_figure()
     bars = slot_bars(plan)
     for place, (_, slots) in enumerate(bars["rows"]):
         for start, end, series, *_ in slots:

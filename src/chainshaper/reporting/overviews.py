@@ -5,7 +5,7 @@ They show a recording (events, callbacks, chains, stalls), a machine (abilities,
 """
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import datetime, timezone
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +27,7 @@ from chainshaper.reporting.tables import (
     YES_NO,
     Column,
     ResultTable,
+    cost_text,
     counted,
     figures,
     listed,
@@ -728,7 +729,9 @@ def broken_table(broken: "Sequence[Judged]") -> ResultTable:
     columns = [*words("recording", "where", "limit"), *figures("budget", "found")]
     table = ResultTable("Limits that are broken", [*columns, *words("because")])
     for judged in broken:
-        shown = percent if judged.is_share else ms
+        shown: Callable[[float | None], str] = percent if judged.is_share else ms
+        if judged.is_cost:
+            shown = cost_text
         values = shown(judged.limit), shown(judged.measured)
         table.add(judged.recording, judged.where, judged.figure, *values, judged.because or "")
     return table
@@ -762,12 +765,17 @@ def sweep_table(frame: pl.DataFrame) -> ResultTable:
     """Make a table of a sweep: the axes and most important figures of the first points."""
     axes = sweep_axes(frame)
     names = [name.removesuffix("_ns") for name in (*axes, *SWEEP_FIGURES.values())]
+    has_cost = frame["control_cost"].count() > 0
+    names += ["control cost"] if has_cost else []
     table = ResultTable("Simulated end-to-end latency [ms]", figures(*names))
     for row in frame.head(MOST_ROWS).to_dicts():
         row["kept"] = PROMISE[row["kept"]]
         cells = [
             ms(row[figure]) if figure.endswith("_ns") else row[figure] for figure in SWEEP_FIGURES
         ]
+        if has_cost:
+            cost = row["control_cost"]
+            cells.append("unstable" if cost is None else f"{cost:.4g}")
         if row["error"] is not None:
             cells = ["failed", *([""] * (len(cells) - 1))]
         table.add(*(sweep_value(name, row[name]) for name in axes), *cells)

@@ -4,6 +4,7 @@ Names from traces stay literal in both. Rich takes brackets for its markup and h
 characters on, so on the terminal every text is a `Text`; in HTML every text is escaped.
 """
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeAlias
@@ -184,6 +185,13 @@ def plain(text: Any, style: str = "") -> Any:
 def ms(nanoseconds: float | None) -> str:
     """A time in milliseconds, or a dash."""
     return ABSENT if nanoseconds is None else milliseconds(nanoseconds)
+
+
+def cost_text(cost: float | None) -> str:
+    """Return a cost with four figures: ``1.413``; ``unstable``; a dash for None."""
+    if cost is None:
+        return ABSENT
+    return f"{cost:.4g}" if math.isfinite(cost) else "unstable"
 
 
 def counted(number: int, noun: str) -> str:

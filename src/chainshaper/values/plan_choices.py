@@ -110,6 +110,12 @@ class Wishes:
     minimise: Annotated[Goal, Option("Objective.", BANDS)] = "mean"
     mean_at_most_ns: Annotated[int | None, Option(
         "Accept no average above this.", BANDS)] = None
+    plant: Annotated[str | None, Option(
+        "Instead, minimise the cost of this control loop (docs/control.md): one slot, bands, or one"
+        " long slot, and where.", BANDS, "PLANT.yaml")] = None
+    redesign: Annotated[bool, Option(
+        "With --plant: the controller may be designed anew for the constant delay of one slot.",
+        BANDS)] = False
     least_gain: Annotated[float, Option(
         "With --bands auto: what another band must take off the average.", BANDS, "SHARE")] = 0.02
     seed: Annotated[int, Option("For pso, random and the derived margin.", BANDS, least=0)] = 0
@@ -188,6 +194,8 @@ class WishKeywords(TypedDict, total=False):
     max_share: float | None
     minimise: Goal
     mean_at_most_ns: int | None
+    plant: str | None
+    redesign: bool
     least_gain: float
     seed: int
     cores: tuple[int, ...] | None
