@@ -20,8 +20,8 @@ only these break is broken, and its message says so. ``missing`` is the share of
 late or never came; ``starts`` is the topic that starts a callback, or the declared period of its
 timer, as `chainshaper callbacks` shows it. ``age_at_loop`` is about the data of the chain's last
 loop, over all of its cycles; ``never`` and ``again`` are shares of the messages: used in no cycle,
-and in several. ``control`` limits what the latencies cost a control loop per second; the path of its
-description is relative to the budget file. ``overruns`` is a share of a loop's instances.
+and in several. ``control`` limits what the latencies cost a control loop per second; the path of
+its description is relative to the budget file. ``overruns`` is a share of a loop's instances.
 ``minimum`` and ``shortest_period`` are the least that is allowed, all others the most.
 """
 
