@@ -65,13 +65,13 @@ class LoopsInStep:
         steps = [step for kept in self.running.values() for step in kept.steps]
         report.show_steps(sorted(steps, key=lambda step: step.at_ns))
         for place, kept in tuple(self.running.items()):
-            named = f"{chain_name(kept.chain)} and the loop of {kept.loop.node}"
+            named = kept.state.name
             if kept.failure is not None:
                 del self.running[place]
                 kept.end()
                 report.note(f"{named} are not in step any more: {kept.failure}")
             else:
-                report.replace_notes(f"{named} are not in step", *_missing(named, kept))
+                report.replace_notes(f"{named} are not in step", *_missing(kept))
 
     def end(self) -> None:
         """Slots and loops go back to where the plan, and the loops themselves, have them."""
@@ -102,11 +102,13 @@ def _refuse_closed(anchored: AnchoredPlan, chain: ChainPlan) -> None:
         )
 
 
-def _missing(named: str, kept: InStep) -> Sequence[str]:
+def _missing(kept: InStep) -> Sequence[str]:
     """Say what is missing for both to be in step, if something is."""
-    if kept.is_in_step:
+    state = kept.state
+    if state.in_step:
         return ()
-    if not kept.has_loop:
-        remedy = "start it beneath the library in front: `chainshaper watch -- COMMAND`"
-        return (f"{named} are not in step: no such loop is seen to sleep; {remedy}",)
-    return (f"{named} are not in step now: {kept.waits_for}",)
+    if not state.is_there:
+        return (
+            f"{state.text}; start it beneath the library in front: `chainshaper watch -- COMMAND`",
+        )
+    return (state.text,)
