@@ -154,7 +154,12 @@ def find_anchor(run: Supervision, phase_ns: int | None) -> None:
     )
 
 
-MOVED: dict[str, Any] = {"latest_ns": MS, "looks": 1, "expect": lambda _: None}
+MOVED: dict[str, Any] = {
+    "latest_ns": MS,
+    "looks": 1,
+    "expect": lambda _: None,
+    "slots_wait": False,
+}
 
 
 @pytest.mark.parametrize("measured", [True, False])
@@ -178,7 +183,7 @@ def test_a_timer_that_comes_earlier_is_not_counted_twice(
     """
     looks = iter([-MS // 2])
 
-    def look(_: DriftWatch, _near: int | None, _expected: int) -> int:
+    def look(_: DriftWatch, _near: int | None, _expected: int, _cycles: int) -> int:
         for seen in looks:
             return seen
         raise OperationError("the thread has ended")
@@ -200,7 +205,7 @@ def test_a_look_during_which_slots_moved_is_soon_repeated(monkeypatch: pytest.Mo
     """Slots open earlier until their timer is seen: seconds, not two times ten of them."""
     expected_by, watches = list[int](), list[DriftWatch]()
 
-    def look(_: DriftWatch, _near: int | None, expected: int) -> int:
+    def look(_: DriftWatch, _near: int | None, expected: int, _cycles: int) -> int:
         expected_by.append(expected)
         if len(expected_by) == 2:
             watches[0].expect(expected - MS)  # slots move meanwhile
@@ -218,6 +223,31 @@ def test_a_look_during_which_slots_moved_is_soon_repeated(monkeypatch: pytest.Mo
     wait_for(lambda: len(expected_by) == 3, "the look to be repeated")
     assert expected_by == [48 * MS, 48 * MS, 47 * MS]
     assert watches[0].looks == 1, "what was seen while slots moved counts for nothing"
+
+
+def test_slots_that_open_early_wait_for_a_short_look(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The chain began 2 ms sooner for 10 of 40 s; where nothing is seen, looks are as always."""
+    looked, watches = list[int](), list[DriftWatch]()
+
+    def look(_: DriftWatch, _near: int | None, _expected: int, cycles: int) -> int | None:
+        looked.append(cycles)
+        if len(looked) == 4:
+            raise OperationError("the thread has ended")
+        if len(looked) == 2:
+            watches[0].slots_wait = True
+            watches[0].expect(47 * MS)  # slots move during the short look
+        return None if len(looked) == 3 else 0
+
+    monkeypatch.setattr(DriftWatch, "_look", look)
+    monkeypatch.setattr(DriftWatch, "EVERY_S", 1e6)
+    watches.append(DriftWatch(1, [1], 100 * MS, 48 * MS))
+    watches[0].look_soon = True
+    wait_for(lambda: watches[0].looks == 1, "the first look")
+    assert not watches[0].slots_wait
+    watches[0].slots_wait = True
+    wait_for(lambda: len(looked) == 4, "looks until it is seen")
+    assert looked == [8, 4, 4, 8]
+    assert watches[0].looks == 1
 
 
 def test_a_run_that_is_to_end_while_its_slots_move_has_not_failed(tmp_path: Path) -> None:
@@ -352,7 +382,8 @@ def found(*tids: int) -> Allocation:
 class Watch:
     """A watch over where a thread begins, that sees nothing."""
 
-    looks, latest_ns, surely_ns, look_soon, failure = 0, None, None, False, None
+    looks, latest_ns, surely_ns, failure = 0, None, None, None
+    look_soon = slots_wait = False
 
     def __init__(
         self, _: int, tids: Sequence[int], __: int, expected_ns: int, *___: Any, **____: Any

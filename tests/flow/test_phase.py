@@ -278,7 +278,7 @@ def test_one_look_at_a_busy_machine_moves_nothing(monkeypatch: pytest.MonkeyPatc
     """A thread that was late throughout one look has not moved; one that is twice so has."""
     looks, surely = iter([10_000, 330_000, -20_000, 400_000, 420_000]), list[int | None]()
 
-    def look(watch: DriftWatch, _near: int | None, _expected: int) -> int:
+    def look(watch: DriftWatch, _near: int | None, _expected: int, _cycles: int) -> int:
         surely.append(watch.surely_ns)
         if (seen := next(looks, None)) is None:
             raise OperationError("the thread has ended")

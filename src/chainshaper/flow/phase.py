@@ -234,10 +234,11 @@ class DriftWatch:
     * ``latest_ns``: how far the beginning is from where it is expected (None: not seen yet).
     * ``looks``: how many looks have seen the thread.
     * ``look_soon``: set it, and the next look comes after a second.
+    * ``slots_wait``: set it, and the next look comes at once and is short: slots open early for it.
     """
 
-    EVERY_S, SOON_S = 10.0, 1.0
-    CYCLES = 8
+    EVERY_S, SOON_S, AT_ONCE_S = 10.0, 1.0, 0.05
+    CYCLES, FEW_CYCLES = 8, 4
     NEAR = 0.04  # so much of the cycle before and after
 
     def __init__(
@@ -252,7 +253,7 @@ class DriftWatch:
     ) -> None:
         self.latest_ns: int | None = None
         self._before_ns = 0  # what the look before saw
-        self.looks, self.look_soon = 0, False
+        self.looks, self.look_soon, self.slots_wait = 0, False, False
         self._threads, self._cycle_ns, self._expected_ns = (pid, tids), cycle_ns, expected_ns
         self._slots, self._cores = slots, cores
         self._thread = Background("drift-watch", self._look_again, "looking for it", cores)
@@ -286,23 +287,37 @@ class DriftWatch:
         near_ns: int | None = self._expected_ns
         with suppress(OperationError):  # the thread has ended
             while not self._thread.stop.is_set():
-                until = time.monotonic() + self.EVERY_S
-                while time.monotonic() < until and not self.look_soon:
-                    if self._thread.stop.wait(self.SOON_S):
-                        return
+                if not self._rests():
+                    return
                 was_asked, self.look_soon = self.look_soon, False
+                had_to_wait, self.slots_wait = self.slots_wait, False
                 expected_ns = self._expected_ns
-                drift = self._look(near_ns, expected_ns)
+                cycles = self.FEW_CYCLES if had_to_wait else self.CYCLES
+                drift = self._look(near_ns, expected_ns, cycles)
                 near_ns = None if drift is None else expected_ns + drift
                 if expected_ns != self._expected_ns:  # slots have moved during the look
                     near_ns = self._expected_ns
                     self.look_soon |= was_asked
-                elif drift is not None:
+                    self.slots_wait |= had_to_wait
+                elif drift is None:
+                    self.look_soon |= had_to_wait
+                else:
                     self._before_ns = self.latest_ns or 0
                     self.latest_ns = drift
                     self.looks += 1
 
-    def _look(self, near_ns: int | None, expected_ns: int) -> int | None:
+    def _rests(self) -> bool:
+        """Rest until the next look; return whether there is to be one."""
+        until, asked = time.monotonic() + self.EVERY_S, False
+        while time.monotonic() < until and not asked and not self.slots_wait:
+            soon = time.monotonic() + self.SOON_S
+            while time.monotonic() < soon and not self.slots_wait:
+                if self._thread.stop.wait(self.AT_ONCE_S):
+                    return False
+            asked = self.look_soon
+        return not self._thread.stop.is_set()
+
+    def _look(self, near_ns: int | None, expected_ns: int, cycles: int) -> int | None:
         """Return how far the thread begins from ``expected_ns``; None: it was not seen.
 
         Look near ``near_ns`` only; None: look all the time.
@@ -314,7 +329,7 @@ class DriftWatch:
             place = (now_ns - (near_ns or 0) + near) % cycle_ns
             return 0 if near_ns is None or place < 2 * near else cycle_ns - place
 
-        least_ns, cycles = TO_STOP_NS if self._slots else 0, self.CYCLES
+        least_ns = TO_STOP_NS if self._slots else 0
         pid, tids = self._threads
         seen = watch_wake_ups(
             pid,

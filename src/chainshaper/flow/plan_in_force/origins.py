@@ -93,13 +93,12 @@ def follow_timer(
     looks = 0
     while True:
         before_ns = track.opens_ns
-        if watch.looks > looks:
+        if saw := watch.looks > looks:
             looks = watch.looks
             early = anchored.early(first)
             # Where no server stops the thread, a single look may see it late by chance.
             seen_ns = watch.surely_ns if early else watch.latest_ns
             track.saw((seen_ns or 0) - early, time.monotonic_ns())
-            watch.look_soon = track.is_unsure
         if track.opens_ns != before_ns:
             moved_ns = (began_ns + track.opens_ns) % anchored.plan.cycle_ns
             try:
@@ -114,4 +113,6 @@ def follow_timer(
             report.state = replace(report.state, anchor_ns=moved_ns)
             for place, other in enumerate(watches):
                 other.expect(anchored.begins(place))
+        # A chain begins elsewhere as long as its slots open early: that is over as soon as can be.
+        watch.slots_wait |= saw and track.is_unsure
         yield track.opens_ns

@@ -35,6 +35,7 @@ from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import ChainshaperError, OperationError
 
 PHASE_BOUND_NS = 250_000  # nodes get the beginning of cycles again when it has moved by more
+SLOTS_S = 0.1  # so often it is looked where slots are to be
 _FLEETING = 3  # so many threads that a look finds, and the next does not, are worth a note
 
 
@@ -89,11 +90,23 @@ class Supervision:
                 self.report.state = shown
                 return
             self.send_moves(moved, followed_ns, messages)
-            if self.stop.wait(LOOK_S):
+            if self.follow_until_next_look(following):
                 continue
             if self.guardians is not None:
                 self.guardians.renew()
             latest, untaken = self.look_again(latest)
+
+    def follow_until_next_look(self, following: Iterator[int]) -> bool:
+        """Wait until it is time to look again; return whether the run is to end.
+
+        Slots that open early for a chain's timer to be seen go back as soon as it was.
+        """
+        until = time.monotonic() + LOOK_S
+        while (left := until - time.monotonic()) > 0:
+            if self.stop.wait(min(left, SLOTS_S)):
+                return True
+            next(following)
+        return self.stop.is_set()
 
     def note_blind_watches(self) -> None:
         """Note why it is not known any more where cycles begin."""
