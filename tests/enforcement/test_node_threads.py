@@ -458,6 +458,17 @@ def test_receivers_of_one_process_take_turns_and_stand_below_its_loop() -> None:
         assert alone[300] == SchedulingRequest(priority, (1,)), "nothing else has its place"
 
 
+def test_threads_of_a_multi_threaded_executor_in_a_server_take_turns() -> None:
+    """Four of rclcpp's with a callback that sleeps longer than its timer's period, at one priority
+    on one core: 0 instances in 9 s under SCHED_FIFO, 588 under SCHED_RR, 1568 without a priority.
+    """
+    plan = _plan(_server("chain", EXECUTOR_A, PlannedThread(node="/b"), priority=2))
+    both = _node("/a", 200, "executor", "executor"), _node("/b", 300, "executor")
+    wanted = _by_tid(plan_scheduling(plan, _allocation(*both), (0, 1)))
+    assert wanted[200] == wanted[201]
+    assert [wanted[tid].takes_turns for tid in (200, 300)] == [True, False], "/b has one thread"
+
+
 def test_receivers_with_a_place_stand_above_the_chain_and_behind_its_gates() -> None:
     """87 and 86 for outputs, and 84 for the chain, with room for publishers in between."""
     place = ReceiverPlace(core=1, priority=1, time_ns=MS)

@@ -10,9 +10,10 @@ SCHED_FIFO priorities (DESIGN section 6). From the most urgent:
   the plan names their nodes: at one priority, callbacks that become ready at once would run in the
   order in which DDS happens to deliver. Where priorities are too few, the last threads of a server
   share one. Where slots are as long as single callbacks took, all but the first share one, as they
-  did when that was measured (:attr:`~chainshaper.planning.plan.Plan.most_urgent_first`). Threads
-  take turns (SCHED_RR) only if the plan wants that: a turn ends within a callback, which then waits
-  for another thread;
+  did when that was measured (:attr:`~chainshaper.planning.plan.Plan.most_urgent_first`). Different
+  executors take turns (SCHED_RR) only if the plan wants that: a turn ends within a callback, which
+  then waits for another thread. The threads of a multi-threaded executor always do, since one that
+  asks for work without pause would keep the core for ever (see below);
 * nodes that receive what a shaping node publishes. Where the plan has a place for them, that is
   behind the shaping nodes and above everything else there. Otherwise they are below all servers, on
   the shaping node's core or, in a plan of several chains, whose servers keep that core busy, on the
@@ -33,7 +34,7 @@ All other threads are left alone.
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain as joined
 from types import MappingProxyType
@@ -211,6 +212,7 @@ def scheduling_around(
         free_cores = tuple(sorted(set(available_cores) - set(clear)))
     concerned = receiving_pids | {item.node_thread.thread.pid for item in in_servers}
     concerned |= _routers_of(concerned, allocation)
+    in_servers = _taking_turns(in_servers, of=lambda listed: (listed.thread.pid, listed.nodes))
     wanted = [*in_servers, *receiving]
     for listed in allocation.threads:
         if listed.thread.pid in concerned and listed.thread.identity not in planned:
@@ -293,17 +295,26 @@ def _receiving(
         if not is_placed or not set(busy).isdisjoint(listed.thread.cores):
             request = SchedulingRequest(priority, (core,))
             receiving.append(WantedScheduling(listed, request, None, reason))
-    return _taking_turns(receiving), pids
+    return _taking_turns(receiving, of=lambda listed: listed.thread.pid), pids
 
 
-def _taking_turns(receiving: Sequence[WantedScheduling]) -> list[WantedScheduling]:
-    """Have threads of one process that share a core at one priority take turns."""
-    sharing = Counter((item.node_thread.thread.pid, item.scheduling) for item in receiving)
+def _taking_turns(
+    wanted: Sequence[WantedScheduling], of: Callable[[NodeThread], Hashable]
+) -> list[WantedScheduling]:
+    """Have executors' threads take turns that share a core at one priority.
+
+    ``of``: what such threads have in common. Threads of the ordinary class share it anyway.
+    """
+    sharing = Counter(
+        (of(item.node_thread), item.scheduling)
+        for item in wanted
+        if item.node_thread.thread.role == "executor" and item.scheduling.priority
+    )
     return [
         replace(item, scheduling=replace(item.scheduling, takes_turns=True))
-        if sharing[item.node_thread.thread.pid, item.scheduling] > 1
+        if sharing[of(item.node_thread), item.scheduling] > 1
         else item
-        for item in receiving
+        for item in wanted
     ]
 
 
