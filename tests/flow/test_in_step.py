@@ -1,10 +1,13 @@
 """Outputs and loops in step: clocks that drift for half an hour, restarts, places out of reach."""
 
 import random
+import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
+from threading import Event
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -313,6 +316,28 @@ def test_how_both_are_is_measured(follow: Callable[..., InStep], moves: str) -> 
     run(world, kept, 1)
     assert not kept.state.is_there
     assert "no such loop is seen to sleep" in kept.state.text
+
+
+def test_a_run_shows_how_both_are_while_they_are_looked_at(follow: Callable[..., InStep]) -> None:
+    """A real run had ended with "deque mutated during iteration": two threads, many starts."""
+    world = World(plan_in_step("loop"), 50.0)
+    kept, over, shown = follow(world), Event(), list[int]()
+
+    def show() -> None:
+        while not over.is_set():
+            shown.append(kept.state.misses)
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    with ThreadPoolExecutor(1) as others:
+        showing = others.submit(show)
+        try:
+            run(world, kept, 30)
+        finally:
+            over.set()
+            sys.setswitchinterval(interval)
+        showing.result()
+    assert len(shown) > 100 and kept.state.starts > 1000
 
 
 def loop_state(**values: Any) -> LoopState:

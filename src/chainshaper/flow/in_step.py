@@ -16,7 +16,7 @@ loop. Moves are of less than a step, and later ones small, as the drift has it.
 """
 
 import time
-from collections import deque
+from bisect import bisect_left
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
@@ -169,7 +169,9 @@ class InStep:
         self._late_ns = 0  # the loop cannot be where it is to be, and starts so much later
         self._unreachable_ns = self.period_ns  # from here on a move changes the loop's rate
         self._looks = 0
-        self._off = deque[tuple[int, int]]()  # when a start was seen, and how far it was off
+        # When a start was seen, and how far it was off. Others read it while it is followed, so
+        # that it is replaced, never changed.
+        self._off: tuple[tuple[int, int], ...] = ()
         self._settles = False  # something was moved at the latest look
         self._thread = Background("in-step", self._follow, "following", cores)
         self._thread.start()
@@ -242,7 +244,7 @@ class InStep:
     @property
     def state(self) -> LoopState:
         """How both are now."""
-        loop, origin = self._loops.phase, self._origins.phase
+        loop, origin, off = self._loops.phase, self._origins.phase, self._off
         drift_ppm = None
         if loop is not None and origin is not None:
             drift_ppm = round(loop.drift_ppm - origin.drift_ppm, 1)
@@ -259,8 +261,8 @@ class InStep:
             error_ns=self.error_ns,
             drift_ppm=drift_ppm,
             age_ns=self.age_ns,
-            starts=len(self._off),
-            misses=sum(abs(off) > self.loop.lead_ns for _, off in self._off),
+            starts=len(off),
+            misses=sum(abs(off_ns) > self.loop.lead_ns for _, off_ns in off),
         )
 
     def end(self) -> None:
@@ -334,12 +336,12 @@ class InStep:
     def _judge(self, starts: Sequence[int], has_moved: bool) -> None:
         """Note how far starts were from their place, as far as they were to be there."""
         origin, now = self._origins.phase, time.monotonic_ns()
-        while self._off and self._off[0][0] < now - _MINUTE_NS:
-            self._off.popleft()
+        recent = self._off[bisect_left(self._off, (now - _MINUTE_NS,)) :]
         # Between two looks the output, or the loop, moves from one place to the next.
         settles, self._settles = self._settles or has_moved, False
         if origin is not None and self.is_in_step and not (settles or self._elsewhere):
-            self._off += ((now, self._off_ns(start, origin)) for start in starts)
+            recent += tuple((now, self._off_ns(start, origin)) for start in starts)
+        self._off = recent
 
     def _move_loop(self, mover: LoopStarts, loop: LoopPhase, origin: LoopPhase) -> None:
         output = origin.at_ns + self._slot_ns + self.loop.lead_ns
