@@ -155,8 +155,9 @@ def test_turns_without_a_write_or_an_update_have_no_end_and_are_there() -> None:
 def test_what_it_publishes_in_a_turn_is_published_by_the_loop() -> None:
     story = in_time(1100, 1200, 1300, 1400)
     state = story.publisher(story.node("/states", PID), "/states")
-    changes = story.publisher(story.node("/forward", PID), "/forward/transition_event")
-    story.publish(changes, 1119, LOOP)
+    forward = story.node("/forward", PID)
+    for topic in ("/forward/transition_event", "/follow_path/_action/status"):  # states, no outputs
+        story.publish(story.publisher(forward, topic), 1119, LOOP)
     for at in (1120, 1220, 1320, 1420):
         story.publish(state, at, LOOP)
     graph = graph_of(flow_of(story))

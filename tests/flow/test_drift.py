@@ -22,7 +22,7 @@ from chainshaper.enforcement.servers import ServerCounters
 from chainshaper.enforcement.undoing import RunState, SlotMove
 from chainshaper.flow import anchoring, apply
 from chainshaper.flow.background import Background
-from chainshaper.flow.drift import SlotFollower, TimerTrack
+from chainshaper.flow.drift import AHEAD_NS, ONCE_MORE_NS, SlotFollower, TimerTrack
 from chainshaper.flow.phase import DriftWatch, Phase
 from chainshaper.flow.plan_in_force import origins, supervision
 from chainshaper.flow.plan_in_force import threads as run_threads
@@ -223,6 +223,33 @@ def test_a_look_during_which_slots_moved_is_soon_repeated(monkeypatch: pytest.Mo
     wait_for(lambda: len(expected_by) == 3, "the look to be repeated")
     assert expected_by == [48 * MS, 48 * MS, 47 * MS]
     assert watches[0].looks == 1, "what was seen while slots moved counts for nothing"
+
+
+def test_a_run_says_while_its_slots_open_early(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From before they do, until three cycles behind the look that has seen the timer."""
+    now = [1_000 * S]
+    monkeypatch.setattr("time.monotonic_ns", lambda: now[0])
+    early_as_armed = list[bool]()
+
+    def arm(_: int) -> None:
+        early_as_armed.append(begun.anchored.opens_early)
+
+    begun, here = run_of(tmp_path, one_server_plan(), waits_ns=[LEAD_NS], **MOVED, arm=arm)
+    moves, seen = following(begun, here, [here]), list[tuple[int, bool, bool]]()
+    # The slot let it go; half a minute later the timer is looked for, and 0.4 ms earlier again,
+    # which is when it is where it was: 2 ms before the slot.
+    for looks, begins_ns in enumerate((0, 0, AHEAD_NS, AHEAD_NS + ONCE_MORE_NS), start=1):
+        now[0] += 30 * S
+        here.looks, here.latest_ns, here.slots_wait = looks, begins_ns, False
+        seen.append((next(moves), begun.anchored.opens_early, here.slots_wait))
+    first = -LEAD_NS - AHEAD_NS
+    assert seen[:3] == [(0, False, False), (first, True, True), (first - ONCE_MORE_NS, True, True)]
+    assert abs(seen[3][0]) < MS and seen[3][1:] == (True, False)
+    assert early_as_armed == [True, True, True]
+    now[0] += 3 * begun.anchored.plan.cycle_ns
+    assert not begun.anchored.opens_early
 
 
 def test_slots_that_open_early_wait_for_a_short_look(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -78,6 +78,7 @@ class World:
     given_back: int = 0
     turn_ns: int = 0  # is not seen
     alive: bool = True
+    early_ns: int = 0  # the chain begins so much sooner, for its timer to be seen
     draw: random.Random = field(default_factory=lambda: random.Random(1))
     tid: int = 7
 
@@ -94,7 +95,8 @@ class World:
     # As the output that is followed
 
     def origins(self, cycle_ns: int) -> list[int]:
-        return [self.now_ns - self.now_ns % cycle_ns + self.draw.randrange(20_000)]
+        begun = self.now_ns - self.now_ns % cycle_ns - self.early_ns
+        return [begun + self.draw.randrange(20_000)]
 
     def move_output(self, by_ns: int, _: int) -> None:
         self.moved_ns = by_ns
@@ -162,7 +164,8 @@ def follow(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[World], InStep
         monkeypatch.setattr(in_step, "LOOK_S", LOOK_S)
         monkeypatch.setattr(in_step, "FollowedOutput", lambda *_: _Output(world))
         found = lambda: cast("Any", world) if world.alive else None  # noqa: E731
-        kept = InStep(world.plan, (), found, lambda _: world.now_ns)
+        early = lambda: world.early_ns > 0  # noqa: E731
+        kept = InStep(world.plan, (), found, lambda _: world.now_ns, begins_early=early)
         made.append(kept)
         return kept
 
@@ -257,6 +260,26 @@ def test_before_an_instance_in_the_next_cycle_the_output_leaves_at_the_latest(
     run(world, kept, 10)
     assert world.moved_ns == MS and kept.is_in_step
     assert world.off_ns() != 0
+
+
+@pytest.mark.parametrize("moves", ["loop", "output"])
+def test_nothing_moves_while_a_chain_begins_early_for_its_timer_to_be_seen(
+    follow: Callable[..., InStep], moves: str
+) -> None:
+    """The output had gone with its chain, 2 ms sooner, and missed its turn for seconds behind it:
+    90 ms old, then 92, then 100.
+    """
+    world = World(plan_in_step(moves), 0.0)
+    kept = follow(world)
+    run(world, kept, 10)
+    asked, off = len(world.asked), world.off_ns()
+    world.early_ns = 2 * MS
+    run(world, kept, 5)
+    world.early_ns = 0
+    run(world, kept, 10)
+    assert len(world.asked) == asked
+    assert world.off_ns() == off
+    assert kept.is_in_step and kept.state.misses == 0
 
 
 def test_next_move_by_brute_force() -> None:

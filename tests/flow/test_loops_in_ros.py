@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,14 +25,17 @@ SENSOR_MS, LOOP_MS = 20, 10
 
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("looping")
-    for step in (["-S", HERE, "-B", folder], ["--build", folder, "--target", "looping"]):
+    return built("looping", tmp_path_factory.mktemp("looping"))
+
+
+def built(target: str, folder: Path) -> Path:
+    for step in (["-S", HERE, "-B", folder], ["--build", folder, "--target", target]):
         words = ["env", "cmake", *map(str, step)]
         run = subprocess.run(
             words, env=ros2_environment(), capture_output=True, text=True, check=False
         )
         assert run.returncode == 0, run.stdout + run.stderr
-    return folder / "looping"
+    return folder / target
 
 
 def recorded(folder: Path, sensor: str, loop: str, *options: str) -> Path:
@@ -83,13 +87,28 @@ def test_a_loop_in_cpp(program: Path, tmp_path: Path, kind: str) -> None:
     sensor = f'"{program}" /dev/null sensor {SENSOR_MS}'
     recording = recorded(tmp_path, sensor, f'"{program}" "{notes}" {kind} {LOOP_MS}')
     assert_as_noted(recording, notes, "/scan../command")
-    words = ["callbacks", str(recording), "--json"]
-    shown = subprocess.run(
-        [sys.executable, "-m", "chainshaper", *words], capture_output=True, text=True, check=True
-    )
-    (loop,) = (row for row in json.loads(shown.stdout) if row["kind"] == "loop")
+    (loop,) = loops_of(recording)
     assert abs(loop["period_ns"] - LOOP_MS * 1_000_000) < 100_000
     assert loop["execution_ns"]["mean"] > 900_000, "it computes for 1 ms"
+
+
+@pytest.mark.ros2("rclcpp", "rclcpp_action", "example_interfaces")
+def test_a_rate_loop_in_the_threads_of_an_action(program: Path, tmp_path: Path) -> None:
+    """A stand-in for Nav2's controller server: a thread for each goal of 2 s, and one loop."""
+    acting, notes = built("acting", tmp_path / "built"), tmp_path / "notes"
+    sensor = f'"{program}" /dev/null sensor {SENSOR_MS}'
+    recording = recorded(tmp_path, sensor, f'"{acting}" "{notes}" {LOOP_MS} 2000')
+    assert_as_noted(recording, notes, "/scan../command")
+    (loop,) = loops_of(recording)
+    assert len(loop["tids"]) > 3
+    assert abs(loop["period_ns"] - LOOP_MS * 1_000_000) < 100_000
+
+
+def loops_of(recording: Path) -> list[dict[str, Any]]:
+    """The loops that `callbacks` shows."""
+    words = [sys.executable, "-m", "chainshaper", "callbacks", str(recording), "--json"]
+    shown = subprocess.run(words, capture_output=True, text=True, check=True)
+    return [row for row in json.loads(shown.stdout) if row["kind"] == "loop"]
 
 
 @pytest.mark.ros2("rclcpp")

@@ -221,10 +221,14 @@ def _without_repeats(
 def _outside(published: pl.DataFrame, turns: pl.DataFrame) -> pl.DataFrame:
     """Select the publications in turns that no callback made, with the number of their turn.
 
-    That a lifecycle node changes its state is none: ros2_control's loop activates controllers.
+    That a lifecycle node or the goal of an action changes its state is none: ros2_control's loop
+    activates controllers, and the thread of an action, as Nav2's controller has it, ends with its
+    goal.
     """
     topic = pl.col("topic").cast(pl.String)
-    internal = topic.is_in(sorted(INTERNAL_TOPICS)) | topic.str.ends_with("/transition_event")
+    internal = topic.is_in(sorted(INTERNAL_TOPICS))
+    for state in ("/transition_event", "/_action/status"):
+        internal |= topic.str.ends_with(state)
     outside = pl.col("instance").is_null() & ~internal & pl.col("node").is_not_null()
     return _placed(published.filter(outside), turns)
 

@@ -132,6 +132,8 @@ class InStep:
     * ``find``: looks for the loop; it returns its starts until now as well, or None.
     * ``put_in_force``: has servers move their slots by so much (ns), and returns from when on the
       gate has to move its own.
+    * ``begins_early``: whether the chain begins sooner for the moment, for its timer to be seen.
+      Nothing is moved for these few cycles: output and loop would be out of step behind them.
     * ``cores``: where the thread runs; none: anywhere.
 
     Raises OperationError: see :class:`.FollowedOutput`.
@@ -144,6 +146,7 @@ class InStep:
         find: Callable[[], LoopStarts | None],
         put_in_force: Callable[[int], int],
         *,
+        begins_early: Callable[[], bool] = lambda: False,
         cores: Collection[int] = (),
         tolerance_ns: int = TOLERANCE_NS,
     ) -> None:
@@ -157,7 +160,7 @@ class InStep:
         self._slot_ns = publish_slots(chain)[0][0]
         starts = loop.starts_ns or (self._slot_ns, self._slot_ns)
         self._reach_ns = starts[0] - self._slot_ns, starts[1] - self._slot_ns
-        self._find, self._put_in_force = find, put_in_force
+        self._find, self._put_in_force, self._begins_early = find, put_in_force, begins_early
         self._output = FollowedOutput(shaping.output, pids)
         self._origins = PhaseTrack(chain.cycle_ns, _ORIGINS_NS)
         self.tid = 0  # of the loop's thread, the latest that was found
@@ -279,14 +282,15 @@ class InStep:
     def look(self) -> None:
         """Look where both are, and move what is to be moved."""
         self._looks += 1
-        restarts = self._origins.restarts
-        self._origins.saw(self._output.origins(self.chain.cycle_ns))
+        restarts, origins = self._origins.restarts, self._output.origins(self.chain.cycle_ns)
+        waits = self._begins_early()
+        self._origins.saw([] if waits else origins)
         if self._origins.restarts > restarts:
             self._elsewhere = True
             self._note(None, "the chain begins elsewhere now: its phase is measured anew")
         self._look_at_loop()
         loop, origin = self._loops.phase, self._origins.phase
-        if self._mover is None or loop is None or origin is None:
+        if waits or self._mover is None or loop is None or origin is None:
             return
         if self.loop.in_step == "loop":
             self._move_loop(self._mover, loop, origin)

@@ -2,6 +2,7 @@
 
 import json
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -33,6 +34,8 @@ class AnchoredPlan:
     anchor_ns: int = 0  # from when on slots count, where they have been moved to by now
     waits_ns: list[int] = field(default_factory=list)  # from each timer to its slot, if measured
     moved_ns: dict[int, int] = field(default_factory=dict)  # by how much chains' slots have moved
+    # Slots open early until then (CLOCK_MONOTONIC), for a timer to be seen: chains begin sooner.
+    opens_early_until_ns: float = 0
     # Threads that follow latencies move slots too: it is held while slots change.
     lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -62,6 +65,11 @@ class AnchoredPlan:
         if self.gated and (closed or not self.waits_ns):
             return 0
         return self.waits_ns[place] if self.waits_ns else LEAD_NS
+
+    @property
+    def opens_early(self) -> bool:
+        """Whether chains begin sooner now than they do as a rule."""
+        return time.monotonic_ns() < self.opens_early_until_ns
 
     def save(self, folder: Path) -> None:
         """Write the plan into the run's folder, for recordings of the run."""

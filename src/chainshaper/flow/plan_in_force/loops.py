@@ -41,6 +41,7 @@ class LoopsInStep:
                 pids,
                 partial(self.find, loop),
                 partial(in_force_from, anchored, place),
+                begins_early=lambda: anchored.opens_early,
                 cores=cores,
             )
 

@@ -1,5 +1,6 @@
 """Where chains begin while a plan is in force, and servers that follow a timer that drifts."""
 
+import math
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -99,6 +100,10 @@ def follow_timer(
             # Where no server stops the thread, a single look may see it late by chance.
             seen_ns = watch.surely_ns if early else watch.latest_ns
             track.saw((seen_ns or 0) - early, time.monotonic_ns())
+            if track.is_unsure:
+                anchored.opens_early_until_ns = math.inf
+            elif anchored.opens_early_until_ns == math.inf:  # they go back with the next cycle
+                anchored.opens_early_until_ns = time.monotonic_ns() + 3 * cycle_ns
         if track.opens_ns != before_ns:
             moved_ns = (began_ns + track.opens_ns) % anchored.plan.cycle_ns
             try:
