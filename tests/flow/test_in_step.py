@@ -19,7 +19,7 @@ from small_chain import small_chain_plan
 from chainshaper.analysis.loop_rates import LoopRate
 from chainshaper.enforcement.journal import STATE_FILE
 from chainshaper.enforcement.undoing import LoopState, RunState, save_run_state
-from chainshaper.flow import in_step
+from chainshaper.flow import apply, in_step
 from chainshaper.flow.in_step import InStep, OwnStarts, loops_in_step, next_move
 from chainshaper.monitor import watch as watch_module
 from chainshaper.monitor.watch import Seen, Watch, _values
@@ -34,8 +34,8 @@ from chainshaper.planning.chain_plan import (
 )
 from chainshaper.planning.plan import Plan
 from chainshaper.reporting.overviews import servers_table, watch_tables
-from chainshaper.sources.preload import LoopMoved
-from chainshaper.values.errors import InputError
+from chainshaper.sources.preload import LoopMoved, named_loops
+from chainshaper.values.errors import InputError, PlatformError
 
 MS, S = 1_000_000, 1_000_000_000
 LEAD = 1 * MS
@@ -315,6 +315,33 @@ def test_a_plan_that_is_in_step_does_not_follow_latencies() -> None:
     with pytest.raises(InputError, match="in step with a loop"):
         loops_in_step(plan, adapt=True)
     assert not loops_in_step(Plan.of(small_chain_plan(10 * MS, 20 * MS)), adapt=True)
+
+
+@pytest.mark.parametrize("path", ["/opt/library.so", "/opt/a path/library.so"])
+def test_what_apply_starts_is_beneath_the_library_where_a_loop_is_in_step(
+    monkeypatch: pytest.MonkeyPatch, path: str
+) -> None:
+    """LD_PRELOAD names no path with a space: an output follows its loop without the library."""
+    monkeypatch.setattr(named_loops, "installed_library", lambda: Path(path))
+    monkeypatch.setenv("CHAINSHAPER_LOOPS", "/other")
+    monkeypatch.delenv("LD_PRELOAD", raising=False)
+    by_name = Plan.of(with_thread(plan_in_step("output"), "control"))
+    if " " in path:
+        assert apply._in_front_of_loops(by_name) == {}
+        for plan in (plan_in_step("loop"), plan_in_step("output")):  # the latter has no name
+            with pytest.raises(PlatformError, match="space"):
+                apply._in_front_of_loops(Plan.of(plan))
+        return
+    variables = apply._in_front_of_loops(by_name)
+    assert variables["LD_PRELOAD"] == path
+    assert variables["CHAINSHAPER_LOOPS"] == "/other,/controller"
+    assert apply._in_front_of_loops(Plan.of(small_chain_plan(10 * MS, 20 * MS))) == {}
+
+
+def with_thread(chain: ChainPlan, name: str) -> ChainPlan:
+    """The plan where the loop's thread has a name, by which it is known from outside."""
+    assert chain.loop is not None
+    return revised(chain, loop=chain.loop.model_copy(update={"thread": name}))
 
 
 @pytest.mark.parametrize("moves", ["loop", "output"])

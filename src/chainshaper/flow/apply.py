@@ -59,7 +59,7 @@ from chainshaper.planning.overruns import publication_warnings
 from chainshaper.planning.plan import Plan
 from chainshaper.splicing.shaped_outputs import gates_of, remove_abandoned_pages
 from chainshaper.values.durations import duration_text
-from chainshaper.values.errors import OperationError
+from chainshaper.values.errors import OperationError, PlatformError
 from chainshaper.values.progress import Progress
 
 if TYPE_CHECKING:
@@ -202,15 +202,24 @@ def _followed(
 def _in_front_of_loops(plan: Plan) -> dict[str, str]:
     """Return the variables by which what we start can be seen to sleep, and be moved.
 
-    Empty: no loop of the plan is in step with an output.
+    Empty: no loop of the plan is in step with an output; or the library cannot be in front, and
+    outputs alone are moved: then wake-ups of the loops are counted from outside.
+
+    Raises PlatformError: the library cannot be in front, and a loop is to be moved.
     """
-    nodes = [loop.node for _, _, loop in loops_in_step(plan)]
-    if not nodes:
+    loops = [loop for _, _, loop in loops_in_step(plan)]
+    if not loops:
         return {}
     from chainshaper.sources.preload import named_loops
 
     before = os.environ.get(named_loops.VARIABLE, "").split(",")
-    return named_loops.in_front_of(list(dict.fromkeys(filter(None, [*before, *nodes]))))
+    names = dict.fromkeys(filter(None, [*before, *(loop.node for loop in loops)]))
+    try:
+        return named_loops.in_front_of(list(names))
+    except PlatformError:
+        if any(loop.in_step == "loop" or loop.thread is None for loop in loops):
+            raise
+        return {}
 
 
 @dataclass
