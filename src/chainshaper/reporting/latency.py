@@ -29,6 +29,7 @@ from chainshaper.reporting.tables import (
     counted,
     counts,
     figures,
+    interval_ms,
     min_mean_max,
     ms,
     percent,
@@ -67,13 +68,13 @@ CONVENTION = (
 def _rows(columns: Sequence[LatencyStatistics | None]) -> dict[str, list[str]]:
     """Make the rows of figures by their titles, with a cell for each column's statistics."""
     cells: dict[str, Callable[[LatencyStatistics], str]] = {
-        "average": lambda statistics: ms(statistics.mean_ns),
-        "minimum": lambda statistics: ms(statistics.min_ns),
-        "maximum": lambda statistics: ms(statistics.max_ns),
-        "jitter (max − min)": lambda statistics: ms(statistics.jitter_ns),
-        "spread p0.5–p99.5": lambda statistics: ms(statistics.spread_ns),
-        "median": lambda statistics: ms(statistics.percentiles_ns.get("50")),
-        "99th percentile": lambda statistics: ms(statistics.percentiles_ns.get("99")),
+        "average": lambda statistics: figure_ms(statistics, "mean_ns"),
+        "minimum": lambda statistics: figure_ms(statistics, "min_ns"),
+        "maximum": lambda statistics: figure_ms(statistics, "max_ns"),
+        "jitter (max − min)": lambda statistics: figure_ms(statistics, "jitter_ns"),
+        "spread p0.5–p99.5": lambda statistics: figure_ms(statistics, "spread_ns"),
+        "median": lambda statistics: figure_ms(statistics, "50"),
+        "99th percentile": lambda statistics: figure_ms(statistics, "99"),
         "cycles": lambda statistics: str(statistics.count),
         "came late": lambda statistics: (
             ABSENT if statistics.late is None else f"{statistics.late} of {statistics.count}"
@@ -83,6 +84,16 @@ def _rows(columns: Sequence[LatencyStatistics | None]) -> dict[str, list[str]]:
         title: [ABSENT if column is None else cell(column) for column in columns]
         for title, cell in cells.items()
     }
+
+
+def figure_ms(statistics: LatencyStatistics, name: str) -> str:
+    """A figure, or a percentile, in ms: between hosts as an interval, ``53.100 ± 0.200``."""
+    bounds = getattr(statistics, "bounds_ns", None)
+    if bounds:
+        return interval_ms(bounds[name])
+    is_percentile = name in statistics.percentiles_ns or not name.endswith("_ns")
+    value = statistics.percentiles_ns.get(name) if is_percentile else getattr(statistics, name)
+    return ms(value)
 
 
 def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[str, Any]:
@@ -132,7 +143,9 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
             (pl.col(end) + info.clock_offset_ns).alias(f"{end}_ns") for end in ("start", "end")
         ]
         complete = analysis.traversals.filter("complete")
-        result["instances"] = complete.select(*times, "latency_ns", "disturbed").to_dicts()
+        columns = ["latency_ns", "disturbed"]
+        columns += [name for name in ("latency_low_ns", "latency_high_ns") if name in complete]
+        result["instances"] = complete.select(*times, *columns).to_dicts()
         if analysis.data_age is not None:
             times = [
                 (pl.col(end) + info.clock_offset_ns).alias(f"{end}_ns")
@@ -401,8 +414,9 @@ def _brief(statistics: LatencyStatistics, bands: int) -> str:
     """
     late = "" if statistics.late is None else f", {statistics.late} late"
     if bands > 1:
-        return f"longest {ms(statistics.max_ns)} ms{late}"
-    return f"jitter {ms(statistics.jitter_ns)} ms, spread {ms(statistics.spread_ns)} ms{late}"
+        return f"longest {figure_ms(statistics, 'max_ns')} ms{late}"
+    jitter, spread = (figure_ms(statistics, f"{name}_ns") for name in ("jitter", "spread"))
+    return f"jitter {jitter} ms, spread {spread} ms{late}"
 
 
 def _counts(measurements: Sequence[Measurement]) -> dict[str, list[str]]:
@@ -447,7 +461,7 @@ def headline(names: Sequence[str], measurements: Sequence[Measurement]) -> str:
     calm = [measurement.analysis.undisturbed for measurement in measurements]
     ends = [0, -1] if len(calm) > 1 else [0]
     jitter, average = (
-        " → ".join(f"{ms(getattr(calm[n], field))} ms ({names[n]})" for n in ends)
+        " → ".join(f"{figure_ms(calm[n], field)} ms ({names[n]})" for n in ends)
         for field in ("jitter_ns", "mean_ns")
     )
     text, judged = f"Jitter {jitter}; average {average}", measurements[-1].prediction
