@@ -253,7 +253,9 @@ def _fitting_rates(hulls: _Hulls) -> tuple[float, float] | None:
     if not (len(hulls.upper[0]) and len(hulls.lower[0])):
         return -MOST_RATE, MOST_RATE
     edges = [np.diff(value) / np.diff(x) for x, value in (hulls.upper, hulls.lower)]
-    rates = np.unique(np.clip(np.concatenate((*edges, [-MOST_RATE, MOST_RATE])), -MOST_RATE, MOST_RATE))
+    rates = np.unique(
+        np.clip(np.concatenate((*edges, [-MOST_RATE, MOST_RATE])), -MOST_RATE, MOST_RATE)
+    )
     gap = _gap(hulls, rates) + _ROUNDED_NS
     best = int(np.argmax(gap))
     if gap[best] < 0:
@@ -399,8 +401,8 @@ def _running(values: Numbers, start: float) -> Numbers:
 def _piece(bounds: _Bounds, span: _Span, wander: float) -> tuple[Piece, _Cone]:
     """Make a piece of its own bounds: the line in the middle of all that fit, and the cone."""
     hulls = _hulls(bounds, span.since, span.until)
-    fitting = _fitting_rates(hulls)
-    assert fitting is not None  # a part of what a line fits
+    # It is a part of what a line fits; without it, rounding would be to blame.
+    fitting = _fitting_rates(hulls) or (-MOST_RATE, MOST_RATE)
     rate = (fitting[0] + fitting[1]) / 2
     (upper_x, upper), (lower_x, lower) = hulls.upper, hulls.lower
     highest = (upper - rate * upper_x).min(initial=np.inf)
@@ -443,7 +445,9 @@ def _after(
     joint = _cone(bounds, _joint_span(bounds, before, piece), _joint(cone, own_cone))
     x = np.unique(np.concatenate((joint.upper_x, joint.lower_x)))
     if (joint.highest(x) + _ROUNDED_NS >= joint.lowest(x)).all():
-        share = float(np.clip(-jumps[0] / (jumps[1] - jumps[0]), 0, 1)) if jumps[0] != jumps[1] else 0.5
+        share = (
+            float(np.clip(-jumps[0] / (jumps[1] - jumps[0]), 0, 1)) if jumps[0] != jumps[1] else 0.5
+        )
         at = since + round(share * (until - since))
         begins = at + int(before.line(np.array([at], dtype=np.int64))[0])
         return replace(piece, begins=begins, is_step=False)
@@ -486,7 +490,9 @@ def _in_cells(bounds: _Bounds, pieces: list[Piece], cones: list[_Cone]) -> Corri
             # By which line an instant was converted here, and which holds, is not known.
             both, edges = [cone, cones[number + 1]], _edges(until, begun, 1)
         else:
-            joint = _cone(bounds, _joint_span(bounds, piece, following), _joint(cone, cones[number + 1]))
+            joint = _cone(
+                bounds, _joint_span(bounds, piece, following), _joint(cone, cones[number + 1])
+            )
             both, edges = [joint], _edges(until, begun, cells)
         parts.append(_cells(bounds, both, [piece, following], edges, -1))
     return Corridor(
@@ -549,9 +555,7 @@ def _joint_span(bounds: _Bounds, piece: Piece, following: Piece) -> "_Span":
     return _Span(since, until)
 
 
-def _widest(
-    bounds: _Bounds, cone: _Cone, piece: Piece, edges: Times
-) -> tuple[Times, Times]:
+def _widest(bounds: _Bounds, cone: _Cone, piece: Piece, edges: Times) -> tuple[Times, Times]:
     """Return how far, at most, the corridor reaches over and under a line between the edges.
 
     Between two times at which it is known it rises and falls no faster than the rates allow.

@@ -7,7 +7,7 @@ how far the host's clock may run faster or slower than by the line it was conver
 that clock jumped meanwhile.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -28,11 +28,12 @@ class BoundedStatistics(LatencyStatistics):
     """Statistics of latencies that are known as intervals; each figure's own interval.
 
     ``bounds_ns`` has the lowest and the highest value that `min_ns`, `mean_ns`, `max_ns`,
-    `jitter_ns`, `spread_ns`, and each percentile by its name, may truly have. That of the jitter
-    holds whatever the errors of single latencies are; if all have the same, it is narrower.
+    `jitter_ns` and `spread_ns` may truly have, ``percentile_bounds_ns`` the same of percentiles.
+    That of the jitter holds whatever the errors of single latencies are.
     """
 
-    bounds_ns: dict[str, Interval] | None = None
+    bounds_ns: dict[str, Interval] = field(default_factory=dict)
+    percentile_bounds_ns: dict[str, Interval] = field(default_factory=dict)
 
 
 def bounded_statistics(
@@ -40,7 +41,7 @@ def bounded_statistics(
 ) -> LatencyStatistics:
     """Add to statistics the intervals that follow from those of all latencies (ns)."""
     lowest, highest = latency_statistics(low), latency_statistics(high)
-    values = {field.name: getattr(statistics, field.name) for field in fields(LatencyStatistics)}
+    values = {each.name: getattr(statistics, each.name) for each in fields(LatencyStatistics)}
     if not lowest.count:
         return statistics
     bounds = {
@@ -48,12 +49,11 @@ def bounded_statistics(
         for name in ("min_ns", "mean_ns", "max_ns")
     }
     of_percentiles = {
-        name: (value, highest.percentiles_ns[name])
-        for name, value in lowest.percentiles_ns.items()
+        name: (value, highest.percentiles_ns[name]) for name, value in lowest.percentiles_ns.items()
     }
     bounds["jitter_ns"] = _difference(bounds["max_ns"], bounds["min_ns"])
     bounds["spread_ns"] = _difference(of_percentiles["99.5"], of_percentiles["0.5"])
-    return BoundedStatistics(**values, bounds_ns=bounds | of_percentiles)
+    return BoundedStatistics(**values, bounds_ns=bounds, percentile_bounds_ns=of_percentiles)
 
 
 def _difference(larger: Interval, smaller: Interval) -> Interval:
@@ -71,7 +71,9 @@ def with_intervals(flow: DataFlow, frame: pl.DataFrame, hops: pl.DataFrame) -> p
     if clocks is None:
         return frame.drop("received_by")
     first = hops.filter(pl.col("hop") == 0).select("traversal", "instance")
-    instance = frame.select("traversal").join(first, on="traversal", how="left", maintain_order="left")
+    instance = frame.select("traversal").join(
+        first, on="traversal", how="left", maintain_order="left"
+    )
     began = host_of(flow.instances["pid"]).gather(instance["instance"])
     ended = host_of(flow.publications["pid"]).gather(frame["publication"])
     latency = _interval(clocks, frame["start"], began, frame["end"], ended)

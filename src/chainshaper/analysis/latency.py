@@ -29,6 +29,7 @@ from chainshaper.values.errors import shown
 from chainshaper.values.notebook import notebook_html
 from chainshaper.values.recording import Recording
 
+
 def summary(times: pl.Expr) -> pl.Expr:
     """Times as a struct ``{min, mean, max}``; null where there are none."""
     figures = pl.struct(min=times.min(), mean=times.mean(), max=times.max())

@@ -611,8 +611,8 @@ def reception(flow: DataFlow, traversals: Traversals, graph: ApplicationGraph) -
     """Make a frame of when a subscriber's callback started with each traversal's output.
 
     One row per traversal, in order: ``traversal``; ``received`` (ns, null: never); ``received_by``,
-    the process; ``reception_ns`` (since the traversal's start). The subscriber is the first subscription callback of the last
-    topic that received a message at all.
+    the process; ``reception_ns`` (since the traversal's start). The subscriber is the first
+    subscription callback of the last topic that received a message at all.
     """
     output = traversals.chain.topics[-1]
     candidates = [callback.id for callback in graph.callbacks if callback.trigger == output]

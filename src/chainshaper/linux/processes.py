@@ -58,7 +58,6 @@ def boot_id() -> str:
     return text_of(read_proc("/proc/sys/kernel/random/boot_id")).strip()
 
 
-
 def run_users(named: Collection[str | int] = ()) -> frozenset[int]:
     """Return the ids of users that are named, by name or number.
 

@@ -19,6 +19,7 @@ from chainshaper.analysis import (
     latency_statistics,
 )
 from chainshaper.analysis.data_age import DataAge
+from chainshaper.analysis.host_clocks import BoundedStatistics
 from chainshaper.planning import ChainPlan, publish_slots
 from chainshaper.planning.overruns import expected
 from chainshaper.reporting.tables import (
@@ -38,6 +39,7 @@ from chainshaper.reporting.tables import (
 )
 from chainshaper.values.durations import duration_text, milliseconds
 from chainshaper.values.files import write_whole
+from chainshaper.values.hosts import Interval
 from chainshaper.verify.measure import PARTS, Comparison, Measurement, hop_breakdown, part_shares
 from chainshaper.verify.overruns import (
     dropped_text,
@@ -51,6 +53,9 @@ from chainshaper.verify.promises import outputs_due
 
 LATE = ("came late", "maximum", "jitter (max − min)")
 """The rows of all cycles that disturbed cycles change."""
+
+BETWEEN_HOSTS_NS = 1_000
+"""A communication that is known no better than this is shown as an interval."""
 
 JSON_FORMAT = 1
 """Version of the JSON that `latency`, `compare` and `check` print.
@@ -88,12 +93,9 @@ def _rows(columns: Sequence[LatencyStatistics | None]) -> dict[str, list[str]]:
 
 def figure_ms(statistics: LatencyStatistics, name: str) -> str:
     """A figure, or a percentile, in ms: between hosts as an interval, ``53.100 ± 0.200``."""
-    bounds = getattr(statistics, "bounds_ns", None)
-    if bounds:
-        return interval_ms(bounds[name])
-    is_percentile = name in statistics.percentiles_ns or not name.endswith("_ns")
-    value = statistics.percentiles_ns.get(name) if is_percentile else getattr(statistics, name)
-    return ms(value)
+    if isinstance(statistics, BoundedStatistics):
+        return interval_ms({**statistics.bounds_ns, **statistics.percentile_bounds_ns}[name])
+    return ms({**asdict(statistics), **statistics.percentiles_ns}.get(name))
 
 
 def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[str, Any]:
@@ -592,6 +594,7 @@ def breakdown_table(analysis: LatencyAnalysis) -> ResultTable:
     """
     frame = hop_breakdown(analysis)
     waits = frame["waiting_ns"].struct.field("max").fill_null(0).max()
+    between = _communication_intervals(analysis)
     shown = PARTS if waits else PARTS[:2]
     cycles = Column("cycles", footer=str(analysis.statistics.count), detail=True)
     columns = [Column("hop", words=True, footer="together"), cycles]
@@ -604,8 +607,32 @@ def breakdown_table(analysis: LatencyAnalysis) -> ResultTable:
         cells: list[str] = []
         for part in shown:
             cells += [*min_mean_max(row[f"{part}_ns"]), percent(row[f"{part}_share"])]
+        if (intervals := between.get(row["hop"])) is not None:
+            cells[:3] = map(interval_ms, intervals)
         table.add(f"{row['callback']} → {row['topic']}", row["count"], *cells)
     return table
+
+
+def _communication_intervals(
+    analysis: LatencyAnalysis,
+) -> dict[int, tuple[Interval, Interval, Interval]]:
+    """Return the least, mean and longest communication of each hop between hosts, as intervals."""
+    low, high = "communication_low_ns", "communication_high_ns"
+    if low not in analysis.hops.columns:
+        return {}
+    complete = analysis.traversals.filter("complete")
+    hops = analysis.hops.join(complete, on="traversal", how="semi").drop_nulls(low)
+    between = hops.filter((pl.col(high) - pl.col(low)).max().over("hop") > BETWEEN_HOSTS_NS)
+    rows = between.group_by("hop").agg(
+        pl.concat_list(
+            pl.col(column).min(), pl.col(column).mean().round().cast(pl.Int64), pl.col(column).max()
+        )
+        for column in (low, high)
+    )
+    return {
+        hop: ((lows[0], highs[0]), (lows[1], highs[1]), (lows[2], highs[2]))
+        for hop, lows, highs in rows.iter_rows()
+    }
 
 
 def incomplete_table(names: Sequence[str], measurements: Sequence[Measurement]) -> ResultTable:

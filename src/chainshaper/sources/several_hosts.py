@@ -157,7 +157,7 @@ def _best_known(
 
     A bound from a host whose own clock is known to lie in an interval counts from its far end.
     """
-    best: tuple[tuple[int, int], int, OffsetBounds, OffsetBounds] | None = None
+    ranked = list[tuple[tuple[int, int], int, OffsetBounds, OffsetBounds]]()
     for number, host in enumerate(hosts):
         if number in known:
             continue
@@ -171,11 +171,8 @@ def _best_known(
             lowers.append(OffsetBounds(took, sent - took - later))
         upper, lower = _together(uppers), _together(lowers)
         counts = sorted((len(upper.times), len(lower.times)))
-        rank = (counts[0], counts[1])
-        if best is None or rank > best[0]:
-            best = rank, number, upper, lower
-    assert best is not None  # a host is left
-    _, number, upper, lower = best
+        ranked.append(((counts[0], counts[1]), number, upper, lower))
+    _, number, upper, lower = max(ranked, key=lambda entry: entry[0])
     if not (len(upper.times) or len(lower.times)):
         _refuse_apart(hosts, number, known)
     return number, upper, lower
@@ -204,7 +201,9 @@ def _refuse_apart(hosts: Sequence[_Host], number: int, known: Mapping[int, objec
     spans = {each.name: _wall_span(each.recording) for each in (host, *partners)}
     since, until = spans.pop(host.name)
     if spans and all(until < begun or ended < since for begun, ended in spans.values()):
-        texts = [f"{name} from {_at(begun)} to {_at(ended)}" for name, (begun, ended) in spans.items()]
+        texts = [
+            f"{name} from {_at(begun)} to {_at(ended)}" for name, (begun, ended) in spans.items()
+        ]
         raise InputError(
             f"{host.recording.path}: {host.name} was recorded from {_at(since)} to {_at(until)},"
             f" {', '.join(texts)} (by their wall clocks): give recordings of the same time"
@@ -218,8 +217,8 @@ def _refuse_apart(hosts: Sequence[_Host], number: int, known: Mapping[int, objec
         listed = ", ".join(common[:_FEW])
         reason += f" (both know {listed}, but no source timestamp is in both)"
     raise InputError(
-        f"{host.recording.path}: {reason}, so how far their clocks are apart cannot be known: record"
-        " all hosts at the same time, with nodes that take topics of the others"
+        f"{host.recording.path}: {reason}, so how far their clocks are apart cannot be known:"
+        " record all hosts at the same time, with nodes that take topics of the others"
     )
 
 
@@ -265,8 +264,8 @@ def _clock(
     except ContradictingClocksError as error:
         raise InputError(
             f"{host.recording.path}: the clocks of {host.name} and {reference.name} contradict each"
-            f" other: {error}. A clock is being slewed, or set again and again, or events are wrong:"
-            " let the synchronisation settle, and record again"
+            f" other: {error}. A clock is being slewed, or set again and again, or events are"
+            " wrong: let the synchronisation settle, and record again"
         ) from error
     jumps = tuple(ClockStep(since_ns=a, until_ns=b, by_ns=by) for a, b, by in steps(found))
     notes = [
@@ -280,9 +279,9 @@ def _clock(
         claim = "taken"
         sender, taker = (reference, host) if counts[0] else (host, reference)
         notes.append(
-            f"all messages between {reference.name} and {host.name} go to {taker.name}: they bound"
-            f" its clock from one side only. The wall clocks' own claim is taken for the rest, with"
-            f" no error of their synchronisation: let {sender.name} take a topic of {taker.name}"
+            f"all messages between {reference.name} and {host.name} go to {taker.name}: they"
+            f" bound its clock from one side only. The wall clocks' own claim is taken for the"
+            f" rest, with no error of their synchronisation: let {sender.name} take a topic of {taker.name}"
             " (any, once a second) to have an interval that holds."
         )
     else:
@@ -332,10 +331,11 @@ def _with_claim(
     if wrong < -CLAIM_TOLERANCE_NS:
         names = f"{hosts[0].name} and {hosts[number].name}"
         raise InputError(
-            f"{hosts[number].recording.path}: messages between {names} go one way only, and by their"
-            f" wall clocks some were taken {milliseconds(-int(wrong))} ms before they were sent: the"
-            " clocks are not synchronised, and nothing else says how far they are apart. Synchronise"
-            " them, or let one node on each host take a topic of the other, and record again"
+            f"{hosts[number].recording.path}: messages between {names} go one way only, and by"
+            f" their wall clocks some were taken {milliseconds(-int(wrong))} ms before they were"
+            " sent: the clocks are not synchronised, and nothing else says how far they are apart."
+            " Synchronise them, or let one node on each host take a topic of the other, and record"
+            " again"
         )
     edges = np.array([known.times.min(), known.times.max()], dtype=np.int64)
     at = claimed + min(int(wrong), 0) if len(upper.times) else claimed - min(int(wrong), 0)
@@ -381,8 +381,8 @@ def _judged_claim(
     share = np.count_nonzero(wrong > 0) / len(wrong)
     truth = claims[worst] - line[worst]
     return "wrong", [
-        f"the wall clocks of {reference.name} and {host.name} are not synchronised as they claim: by"
-        f" messages they differ by {-truth / 1e6:+.3f} ± "
+        f"the wall clocks of {reference.name} and {host.name} are not synchronised as they claim:"
+        f" by messages they differ by {-truth / 1e6:+.3f} ± "
         f"{milliseconds(int(earlier[worst] + later[worst]) // 2)} ms at the worst, and by more than"
         f" messages allow in {share:.0%} of the time; latencies do not depend on it."
     ]
