@@ -281,7 +281,7 @@ def _clock(
         notes.append(
             f"all messages between {reference.name} and {host.name} go to {taker.name}: they"
             f" bound its clock from one side only. The wall clocks' own claim is taken for the"
-            f" rest, with no error of their synchronisation: let {sender.name} take a topic of {taker.name}"
+            f" rest, without an error: let {sender.name} take a topic of {taker.name}"
             " (any, once a second) to have an interval that holds."
         )
     else:
