@@ -57,6 +57,8 @@ def split(
     wall clocks are wrong: source timestamps too.
     """
     folder.mkdir(exist_ok=True)
+    sent = events.table(recording.events, "rmw_publish").filter(pl.col("pid").is_in(list(second)))
+    theirs_stamped = sent["timestamp"].implode()
     begun = events.first_and_last_start(recording.events)[0]
     paths = []
     for number, (name, clock) in enumerate(zip(names, clocks, strict=True)):
@@ -66,6 +68,12 @@ def split(
             rows = table.filter(theirs if number else ~theirs)
             fields = EVENTS[event].fields if event in EVENTS else ()
             instants = ["time", *(field.name for field in fields if field.kind == "instant")]
+            for column in ("timestamp", "source_timestamp"):
+                if event in ("rmw_publish", "rmw_take") and column in rows.columns:
+                    late = pl.col(column).is_in(theirs_stamped)
+                    stamp = pl.col(column) + wall_ns[0]
+                    stamped = pl.when(late).then(pl.col(column) + wall_ns[1]).otherwise(stamp)
+                    rows = rows.with_columns(stamped.alias(column))
             tables[event] = rows.with_columns(
                 _shown(rows[column], clock) for column in instants if column in rows.columns
             )

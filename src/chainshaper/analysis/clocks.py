@@ -36,6 +36,7 @@ WANDER = 5e-6
 MOST_RATE = 1e-3
 """Two clocks run apart no faster than this; adjtimex slews each by 500 ppm at most."""
 _ROUNDED_NS = 2.0  # what rounding may take from bounds that touch each other
+_BEHIND_NS = 1_000  # how much later, at least, an uncertain stretch ends
 _FIRST_TRIED = 64  # bounds
 _CELLS = 4096  # the corridor is kept as so many cells, and one for each uncertain stretch
 _MOST_PIECES = 10  # so many may have less than:
@@ -76,7 +77,7 @@ class Piece:
     def line(self, times: Times) -> Times:
         """Return the offset on the line at times of the reference."""
         away = np.rint((times - self.origin) * self.rate).astype(np.int64)
-        return self.offset + away
+        return np.asarray(self.offset + away, dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,7 @@ def _inverse(piece: Piece, times: Times) -> Times:
     passed = times - (piece.origin + piece.offset)
     # passed / (1 + rate), but as a small correction: it is rounded to 1 ns over hours.
     correction = np.rint(passed * (piece.rate / (1 + piece.rate))).astype(np.int64)
-    return piece.origin + passed - correction
+    return np.asarray(piece.origin + passed - correction, dtype=np.int64)
 
 
 def corridor(
@@ -467,7 +468,8 @@ def _gap_of(jump: int, events: Times | None, first: int, last: int) -> int | Non
     """Return where the only gap between events as wide as a jump ends; None: it is not the only."""
     if events is None:
         return None
-    inside = events[np.searchsorted(events, first) : np.searchsorted(events, last, side="right")]
+    low, high = np.searchsorted(events, first), np.searchsorted(events, last, side="right")
+    inside = events[max(int(low) - 1, 0) : int(high) + 1]  # where lines may be off by the corridor
     wide = np.flatnonzero(np.diff(inside) >= 0.99 * jump)
     return int(inside[wide[0] + 1]) if len(wide) == 1 else None
 
@@ -485,7 +487,9 @@ def _in_cells(bounds: _Bounds, pieces: list[Piece], cones: list[_Cone]) -> Corri
         following = pieces[number + 1]
         until = max(piece.until - following.unsure, begun + 1)
         parts.append(_cells(bounds, [cone], [piece], _edges(begun, until, cells), number))
-        begun = max(following.since + following.unsure, until + 1)
+        # What was converted by the wrong line, and what had to stay behind that, lies in here too.
+        behind = following.unsure + following.unsure // 100 + _BEHIND_NS
+        begun = max(following.since + behind, until + 1)
         if following.is_step:
             # By which line an instant was converted here, and which holds, is not known.
             both, edges = [cone, cones[number + 1]], _edges(until, begun, 1)

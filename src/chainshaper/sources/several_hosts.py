@@ -12,9 +12,8 @@ may truly have been from that.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -359,9 +358,11 @@ def _judged_claim(
         (times, of_reference), (own_times, of_host) = wall
         by_reference = found.converted(own_times)
         inside = (times >= by_reference[0]) & (times <= by_reference[-1])
-        times = times[inside]
-        there = np.interp(times, by_reference, (of_host - of_host[0]).astype(np.float64))
-        claims = of_reference[inside] - (np.rint(there).astype(np.int64) + of_host[0])
+        times, of_reference = times[inside], of_reference[inside]
+        after = np.clip(np.searchsorted(by_reference, times), 1, len(of_host) - 1)
+        # Between two publications the wall clock may have been set: then it is not known.
+        steady = np.abs(of_host[after] - of_host[after - 1]) <= CLAIM_TOLERANCE_NS
+        times, claims = times[steady], (of_reference - of_host[after])[steady]
     if not len(times):
         return "within", []
     cell = found.cell(times)
@@ -542,8 +543,8 @@ def _joint_info(
         if any(info.realtime is None for info in infos)
         else all(info.realtime for info in infos),
         "notes": tuple(all_notes),
-        "lost": dict(reduce(_added, (info.lost for info in infos), Counter[str]())),
-        "trace_events": dict(reduce(_added, (i.trace_events for i in infos), Counter[str]())),
+        "lost": _sum(info.lost for info in infos),
+        "trace_events": _sum(info.trace_events for info in infos),
         "stall_meter": _joint_meter([meter for meter in meters if meter is not None], len(infos)),
         "chain": chains.pop() if len(chains) == 1 else None,
         "through": tuple(dict.fromkeys(pair for info in infos for pair in info.through)),
@@ -556,10 +557,11 @@ def _joint_info(
     return RecordingInfo(**values)
 
 
-def _added(counts: Counter[str], more: Mapping[str, int]) -> Counter[str]:
-    for name, number in more.items():
-        counts[name] += number
-    return counts
+def _sum(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+    total = Counter[str]()
+    for of_host in counts:
+        total.update(of_host)
+    return dict(total)
 
 
 def _same(values: Iterator[str | None]) -> Any:
