@@ -67,6 +67,7 @@ class Piece:
     since: int
     until: int
     begins: int
+    follows: int  # the last time of the host's clock that the piece before can have shown
     origin: int  # reference's time at which the line has the offset `offset`
     offset: int
     rate: float
@@ -109,7 +110,7 @@ class Corridor:
             inverse = _inverse(piece, times[here])
             result[here] = np.maximum(inverse, least)
             if number + 1 < len(self.pieces):
-                last = np.array([self.pieces[number + 1].begins], dtype=np.int64)
+                last = np.array([self.pieces[number + 1].follows], dtype=np.int64)
                 least = max(least, int(_inverse(piece, last)[0]))
         return result
 
@@ -416,6 +417,7 @@ def _piece(bounds: _Bounds, span: _Span, wander: float) -> tuple[Piece, _Cone]:
         since=bounds.time + int(bounds.x[span.since]),
         until=bounds.time + int(bounds.x[span.until - 1]),
         begins=np.iinfo(np.int64).min,
+        follows=np.iinfo(np.int64).min,
         origin=bounds.time + int(origin),
         offset=bounds.offset + round(offset),
         rate=rate,
@@ -451,27 +453,30 @@ def _after(
         )
         at = since + round(share * (until - since))
         begins = at + int(before.line(np.array([at], dtype=np.int64))[0])
-        return replace(piece, begins=begins, is_step=False)
+        return replace(piece, begins=begins, follows=begins, is_step=False)
     if jump >= 0:
         first, final = since + int(before.line(edges)[0]), until + int(piece.line(edges)[1])
         gap = _gap_of(jump, host_events, first, final)
-        begins = final if gap is None else gap
-        return replace(piece, begins=begins, unsure=jump if gap is None else 0)
+        if gap is None:
+            return replace(piece, begins=final, follows=final, unsure=jump)
+        return replace(piece, begins=gap[1], follows=gap[0])
     gap = _gap_of(-jump, reference_events, since, until)
     # What the host did before its partner's clock jumped is converted to before the gap.
-    at = until if gap is None else gap
+    at = until if gap is None else gap[1]
     begins = at + int(piece.line(np.array([at], dtype=np.int64))[0])
-    return replace(piece, begins=begins, unsure=-jump if gap is None else 0)
+    return replace(piece, begins=begins, follows=begins, unsure=-jump if gap is None else 0)
 
 
-def _gap_of(jump: int, events: Times | None, first: int, last: int) -> int | None:
-    """Return where the only gap between events as wide as a jump ends; None: it is not the only."""
+def _gap_of(jump: int, events: Times | None, first: int, last: int) -> tuple[int, int] | None:
+    """Return the only gap between events as wide as a jump; None: it is not the only one."""
     if events is None:
         return None
     low, high = np.searchsorted(events, first), np.searchsorted(events, last, side="right")
     inside = events[max(int(low) - 1, 0) : int(high) + 1]  # where lines may be off by the corridor
     wide = np.flatnonzero(np.diff(inside) >= 0.99 * jump)
-    return int(inside[wide[0] + 1]) if len(wide) == 1 else None
+    if len(wide) != 1:
+        return None
+    return int(inside[wide[0]]), int(inside[wide[0] + 1])
 
 
 def _in_cells(bounds: _Bounds, pieces: list[Piece], cones: list[_Cone]) -> Corridor:

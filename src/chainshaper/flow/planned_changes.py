@@ -14,7 +14,12 @@ from chainshaper.enforcement.thread_scheduling import (
     waiting_receivers,
 )
 from chainshaper.flow.anchoring import carried_out
-from chainshaper.flow.plan_checks import refuse_other_clocks, refuse_simulated, refuse_unfit
+from chainshaper.flow.plan_checks import (
+    refuse_other_clocks,
+    refuse_several_hosts,
+    refuse_simulated,
+    refuse_unfit,
+)
 from chainshaper.flow.server_tables import server_table
 from chainshaper.flow.threads import find_threads
 from chainshaper.linux.scheduling import available_cores
@@ -48,6 +53,7 @@ def planned_changes(
 
     The commands of LITMUS^RT are returned on any kernel.
     """
+    refuse_several_hosts(plan)
     unopened, plan = plan, open_until_done(plan)
     table = server_table(plan)
     allocation = find_threads(plan, recording, users=users)
