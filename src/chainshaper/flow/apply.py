@@ -33,7 +33,6 @@ from chainshaper.flow.plan_checks import (
     check_publishers,
     refuse_other_clocks,
     refuse_simulated,
-    refuse_several_hosts,
     refuse_unfit,
 )
 from chainshaper.flow.plan_in_force.anchor import AnchoredPlan
@@ -115,7 +114,6 @@ def apply_plan(
     the servers failed, the application ended, or ``stop`` was set before the plan was in force.
     """
     user_ids = run_users(users)
-    refuse_several_hosts(plan)
     server_table(plan)
     check_cores({server.core: f"server {server.name}" for server in plan.servers})
     choice = choose_back_end(back_end)

@@ -16,7 +16,6 @@ from chainshaper.enforcement.thread_scheduling import (
 from chainshaper.flow.anchoring import carried_out
 from chainshaper.flow.plan_checks import (
     refuse_other_clocks,
-    refuse_several_hosts,
     refuse_simulated,
     refuse_unfit,
 )
@@ -53,7 +52,6 @@ def planned_changes(
 
     The commands of LITMUS^RT are returned on any kernel.
     """
-    refuse_several_hosts(plan)
     unopened, plan = plan, open_until_done(plan)
     table = server_table(plan)
     allocation = find_threads(plan, recording, users=users)
