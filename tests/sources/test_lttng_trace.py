@@ -174,7 +174,7 @@ def test_traces_of_different_clocks_or_without_our_events_are_refused(tmp_path: 
     written(tmp_path / "traces" / "one", chain_story())
     text = lttng_metadata({"ros2:rcl_take": {"message": "x64"}})
     write_trace(tmp_path / "traces" / "two", text.replace("d499e0ca", "00000000"), {})
-    with pytest.raises(InputError, match=r"two was taken by another clock than .*one"):
+    with pytest.raises(InputError, match="are both of a host called"):
         open_source(tmp_path / "traces")
     one_event(tmp_path / "mine", "mine:callback_start", {"callback": "x64"}, {"callback": 1})
     assert len(open_source(tmp_path / "mine").events) == 0, "another provider's of the same name"

@@ -21,11 +21,11 @@ from chainshaper.analysis.flow import recorded_flow as recorded_flow
 from chainshaper.analysis.graph import application_graph as application_graph
 from chainshaper.analysis.graph import graph_of as graph_of
 from chainshaper.analysis.latency import LatencyAnalysis as LatencyAnalysis
-from chainshaper.analysis.latency import LatencyStatistics as LatencyStatistics
 from chainshaper.analysis.latency import analyse_latency as analyse_latency
 from chainshaper.analysis.latency import callback_statistics as callback_statistics
 from chainshaper.analysis.latency import executors as executors
-from chainshaper.analysis.latency import latency_statistics as latency_statistics
 from chainshaper.analysis.objects import resolve_objects as resolve_objects
+from chainshaper.analysis.statistics import LatencyStatistics as LatencyStatistics
+from chainshaper.analysis.statistics import latency_statistics as latency_statistics
 from chainshaper.analysis.traversals import REASONS as REASONS
 from chainshaper.analysis.traversals import traverse as traverse

@@ -4,8 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from chainshaper.analysis.chains import find_chain
@@ -20,77 +18,16 @@ from chainshaper.analysis.disturbance import (
 )
 from chainshaper.analysis.flow import DataFlow, data_flow, recorded_flow, timer_calls
 from chainshaper.analysis.graph import graph_of
+from chainshaper.analysis.host_clocks import bounded_statistics, with_hop_intervals, with_intervals
 from chainshaper.analysis.loops import loop_figures
 from chainshaper.analysis.outputs_due import not_begun, with_outputs_due
+from chainshaper.analysis.statistics import LatencyStatistics, latency_statistics
 from chainshaper.analysis.traversals import reception, traverse
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Chain, trigger_text
-from chainshaper.values.durations import milliseconds
 from chainshaper.values.errors import shown
 from chainshaper.values.notebook import notebook_html
 from chainshaper.values.recording import Recording
-
-PERCENTILES: tuple[float, ...] = (0.5, 1, 5, 25, 50, 75, 95, 99, 99.5)
-
-
-@dataclass(frozen=True)
-class LatencyStatistics:
-    """Statistics of a sample of latencies, in whole nanoseconds; None where there is no sample."""
-
-    count: int  # of latencies
-    incomplete: int  # of traversals without a latency, less those that met an inactive node
-    disturbed: int  # how many of `count` were hit by a stall of the machine
-    min_ns: int | None
-    mean_ns: int | None
-    max_ns: int | None
-    jitter_ns: int | None  # max − min (paper: J)
-    spread_ns: int | None  # p99.5 − p0.5
-    percentiles_ns: dict[str, int]  # by `PERCENTILES` as text; linear between the nearest values
-    late: int | None = None  # how many of `count` left behind their slot or cycle; None: not known
-
-    @property
-    def text(self) -> str:
-        """The most important figures in a line."""
-        if self.mean_ns is None or self.max_ns is None or self.jitter_ns is None:
-            return f"no complete cycle, {self.incomplete} incomplete"
-        figures = ("average", self.mean_ns), ("maximum", self.max_ns), ("jitter", self.jitter_ns)
-        parts = [f"{self.count} cycles"]
-        parts += [f"{name} {milliseconds(time_ns)} ms" for name, time_ns in figures]
-        parts += [f"{self.disturbed} disturbed"] if self.disturbed else []
-        parts += [f"{self.incomplete} incomplete"] if self.incomplete else []
-        return ", ".join(parts)
-
-
-def latency_statistics(
-    latency_ns: npt.ArrayLike,
-    disturbed: npt.ArrayLike | None = None,
-    incomplete: int = 0,
-    late: int | None = None,
-) -> LatencyStatistics:
-    """Compute statistics of latencies in ns; ``disturbed`` marks those that a stall hit.
-
-    Disturbed latencies are counted and included. To leave them out, pass only the undisturbed ones.
-    """
-    sample = np.asarray(latency_ns, dtype=np.int64)
-    hit = 0 if disturbed is None else int(np.count_nonzero(np.asarray(disturbed, dtype=bool)))
-    if not len(sample):
-        return LatencyStatistics(0, incomplete, hit, None, None, None, None, None, {}, late)
-    values = np.percentile(sample, PERCENTILES)
-    percentiles = {f"{p:g}": round(float(v)) for p, v in zip(PERCENTILES, values, strict=True)}
-    low, high, mean = int(sample.min()), int(sample.max()), round(int(sample.sum()) / len(sample))
-    spread = percentiles["99.5"] - percentiles["0.5"]
-    return LatencyStatistics(
-        count=len(sample),
-        incomplete=incomplete,
-        disturbed=hit,
-        min_ns=low,
-        mean_ns=mean,
-        max_ns=high,
-        jitter_ns=high - low,
-        spread_ns=spread,
-        percentiles_ns=percentiles,
-        late=late,
-    )
 
 
 def summary(times: pl.Expr) -> pl.Expr:
@@ -248,6 +185,8 @@ class LatencyAnalysis:
     * ``received``: when the subscriber's callback started with the output (ns, null: never).
     * ``reception_ns``: the latency until then.
     * ``reception_disturbed``: whether a stall hit it, or the delivery of its output.
+    * ``latency_low_ns``, ``latency_high_ns``, and the same of ``reception``: in recordings of
+      several hosts only, see :func:`~.host_clocks.with_intervals`.
     """
 
     chain: Chain
@@ -331,13 +270,14 @@ def analyse_latency(
     sent, arrived = judged["end"].fill_null(0), received["received"].fill_null(-1)
     on_its_way = pl.Series(stalled_after(flow, sent.to_numpy(), arrived.to_numpy()))
     frame = judged.drop("origin", "computed_at", "expected_at").with_columns(
-        *(received["received"], received["reception_ns"]),
+        *(received["received"], received["reception_ns"], received["received_by"]),
         disturbed=stalled,
         reception_disturbed=stalled | on_its_way,
     )
+    frame = with_intervals(flow, frame, traversals.hops)
     until = None if between is None else between[1]
     frame = with_outputs_due(flow, frame, releases, due_within(flow, chain, own_due), until)
-    hops = traversals.hops
+    hops = with_hop_intervals(flow, traversals.hops)
     if between is not None:
         since_ns, until_ns = between
         ended = pl.max_horizontal("start", "end")
@@ -371,9 +311,13 @@ def _statistics(frame: pl.DataFrame, column: str) -> LatencyStatistics:
     measured = frame.drop_nulls(column)
     known = measured["late"].count() or not measured.height
     hit = "disturbed" if column == "latency_ns" else "reception_disturbed"
-    return latency_statistics(
+    statistics = latency_statistics(
         measured[column].to_numpy(),
         measured[hit].to_numpy(),
         incomplete=frame.height - measured.height - frame.filter(reason="inactive").height,
         late=int(measured["late"].sum()) if known else None,
     )
+    low, high = (column.replace("_ns", f"_{side}_ns") for side in ("low", "high"))
+    if low not in measured.columns:
+        return statistics
+    return bounded_statistics(statistics, measured[low].to_numpy(), measured[high].to_numpy())

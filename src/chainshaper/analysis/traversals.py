@@ -610,9 +610,9 @@ def _published_at(flow: DataFlow, hop: int, chain: Chain) -> pl.Expr:
 def reception(flow: DataFlow, traversals: Traversals, graph: ApplicationGraph) -> pl.DataFrame:
     """Make a frame of when a subscriber's callback started with each traversal's output.
 
-    One row per traversal, in order: ``traversal``; ``received`` (ns, null: never); ``reception_ns``
-    (since the traversal's start). The subscriber is the first subscription callback of the last
-    topic that received a message at all.
+    One row per traversal, in order: ``traversal``; ``received`` (ns, null: never); ``received_by``,
+    the process; ``reception_ns`` (since the traversal's start). The subscriber is the first
+    subscription callback of the last topic that received a message at all.
     """
     output = traversals.chain.topics[-1]
     candidates = [callback.id for callback in graph.callbacks if callback.trigger == output]
@@ -621,7 +621,11 @@ def reception(flow: DataFlow, traversals: Traversals, graph: ApplicationGraph) -
     taken = known.collect().filter(pl.col("callback_id") == pl.col("callback_id").min())
     # Of several takes the first counts. `by_number` takes the last row, so they are reversed.
     reader = by_number(taken.reverse(), "publication", "instance", flow.publications.height)
-    received = flow.instances["start"].gather(reader.gather(traversals.frame["publication"]))
+    instance = reader.gather(traversals.frame["publication"])
+    received = flow.instances["start"].gather(instance)
     return traversals.frame.select(
-        "traversal", received=received, reception_ns=received - pl.col("start")
+        "traversal",
+        received=received,
+        received_by=flow.instances["pid"].gather(instance),
+        reception_ns=received - pl.col("start"),
     )

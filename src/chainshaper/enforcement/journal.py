@@ -24,7 +24,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
-from chainshaper.linux.processes import user_name, user_of
+from chainshaper.linux.processes import boot_id, user_name, user_of
 from chainshaper.linux.threads import (
     find_thread,
     has_ended,
@@ -305,11 +305,6 @@ def discard_journal(journal: Journal) -> None:
         journal.memory.close()
     with contextlib.suppress(OSError):  # there is more in it, or it is gone
         journal.path.parent.rmdir()
-
-
-def boot_id() -> str:
-    """Return the id that the kernel has given itself when it booted."""
-    return text_of(read_proc("/proc/sys/kernel/random/boot_id")).strip()
 
 
 class LockHolder(NamedTuple):

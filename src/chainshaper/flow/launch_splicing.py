@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from chainshaper.flow.plan_checks import refuse_several_hosts
 from chainshaper.planning.chain_plan import ChainPlan, ShapingNode, revised, shaping_nodes
 from chainshaper.planning.plan import Plan
 from chainshaper.robot.throttling import Rule
@@ -131,6 +132,7 @@ def splice_launch_files(
     """
     if fallback is not None:
         plan = Plan.of(*[revised(chain, fallback=fallback) for chain in plan.chains])
+    refuse_several_hosts(plan)
     if without := [chain for chain in plan.chains if chain.shaping_node is None]:
         raise nothing_to_splice(without[0])
     folder = launching.usable(Path(output))

@@ -12,6 +12,7 @@ from chainshaper.analysis.chains import find_chain
 from chainshaper.analysis.contradictions import refuse_contradicted
 from chainshaper.analysis.data_age import LoopReading
 from chainshaper.analysis.graph import graph_of
+from chainshaper.flow.recorded_profile.across_hosts import profile_across_hosts
 from chainshaper.flow.recorded_profile.chain_profile import profile_of
 from chainshaper.flow.recorded_profile.loops import before_loop, recorded_loop
 from chainshaper.flow.recorded_profile.modes import modes_in_force
@@ -51,6 +52,8 @@ def profile_chains(
     in it, by the description of what ran. What happened before ``since_ns`` or from ``until_ns`` on
     is left out.
 
+    Of a chain across several hosts only the upper ends of its latencies are profiled.
+
     Of a chain that goes through a loop, what comes before the last one is profiled, with what was
     measured of that loop.
 
@@ -64,6 +67,11 @@ def profile_chains(
         until = None if until_ns is None else begun + until_ns
         recording = replace(recording, events=events.happened(all_events, begun + since_ns, until))
     flow = recorded_flow(recording)
+    if recording.info.hosts:
+        specs = [chain_of(recording, chain, flow) for chain in chains]
+        return tuple(
+            profile_across_hosts(recording, flow, spec, period_ns, modes) for spec in specs
+        )
     measured = [_measured(flow, chain_of(recording, chain, flow)) for chain in chains]
     analyses = [of_chain.analysis for of_chain in measured]
     stages = [graph_stages(analysis.graph, analysis.chain) for analysis in analyses]

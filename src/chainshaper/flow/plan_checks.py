@@ -30,6 +30,18 @@ if TYPE_CHECKING:
 _LONGEST_SETTINGS = 1 << 20  # of a file of a node's parameters or profiles (bytes)
 
 
+def refuse_several_hosts(plan: Plan) -> None:
+    """Refuse to put a plan in force whose chain goes over several hosts. Raises InputError."""
+    for chain in plan.chains:
+        if chain.evidence.hosts:
+            raise InputError(
+                f"{chain.chain.spec} goes over {', '.join(chain.evidence.hosts)}: its slots count"
+                " from when a node of another computer began, by that one's clock, which nothing"
+                " follows yet. Plan the part of the chain that runs on this computer, from its"
+                " recording"
+            )
+
+
 def refuse_unfit(plan: Plan, back_end: str) -> None:
     """Refuse a back end that cannot carry out all of the plan. Raises InputError."""
     if not gates(back_end) and any(chain.offset_ns for chain in plan.chains):

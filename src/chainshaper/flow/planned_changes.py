@@ -14,7 +14,11 @@ from chainshaper.enforcement.thread_scheduling import (
     waiting_receivers,
 )
 from chainshaper.flow.anchoring import carried_out
-from chainshaper.flow.plan_checks import refuse_other_clocks, refuse_simulated, refuse_unfit
+from chainshaper.flow.plan_checks import (
+    refuse_other_clocks,
+    refuse_simulated,
+    refuse_unfit,
+)
 from chainshaper.flow.server_tables import server_table
 from chainshaper.flow.threads import find_threads
 from chainshaper.linux.scheduling import available_cores

@@ -75,6 +75,9 @@ def recorded_processes(
     if platform.node() not in taken_on.split(", "):
         where = f"was taken on {taken_on or 'an unknown machine'}, so its thread ids say nothing"
         return (), (f"{recording.path} {where} about {platform.node()}",)
+    if info.hosts:
+        where = "has several hosts: name the recording that was taken here"
+        return (), (f"{recording.path} {where}",)
     names = ("rcl_node_init", "callback_start")
     seen = pl.concat(events.table(tables, name).select("pid", "time") for name in names)
     last = seen.drop_nulls().group_by("pid").agg(pl.col("time").max())

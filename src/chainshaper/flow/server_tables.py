@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Sequence
 
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
+from chainshaper.flow.plan_checks import refuse_several_hosts
 from chainshaper.planning.chain_plan import Server
 from chainshaper.planning.plan import Plan
 from chainshaper.values.errors import OperationError
@@ -11,8 +12,9 @@ from chainshaper.values.errors import OperationError
 def server_table(plan: Plan) -> ServerTable:
     """Return the servers of a plan whose threads a back end has to keep inside their slots.
 
-    Raises OperationError: there are none.
+    Raises OperationError: there are none. InputError: the plan's chain goes over several hosts.
     """
+    refuse_several_hosts(plan)
     servers = [server for server in plan.servers if set(server.threads) - plan.free_threads]
     if not servers:
         raise OperationError(

@@ -36,7 +36,7 @@ import yaml
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from chainshaper.analysis import latency_statistics
-from chainshaper.analysis.latency import PERCENTILES
+from chainshaper.analysis.statistics import PERCENTILES
 from chainshaper.control.costs import NEVER, cost_over
 from chainshaper.control.plant_file import LoopDescription, load_loop
 from chainshaper.flow.plan import profile_chains

@@ -53,6 +53,11 @@ _WITH_VALUE = {"-p", "--param", "--params-file", "-e", "--enclave"}
 _WITH_VALUE |= {"--log-level", "--log-config-file", "--log-file-name"}
 
 
+def boot_id() -> str:
+    """Return the id that the kernel has given itself when it booted."""
+    return text_of(read_proc("/proc/sys/kernel/random/boot_id")).strip()
+
+
 def run_users(named: Collection[str | int] = ()) -> frozenset[int]:
     """Return the ids of users that are named, by name or number.
 

@@ -40,14 +40,9 @@ from chainshaper.analysis import recorded_flow
 from chainshaper.analysis.contradictions import refuse_contradicted
 from chainshaper.analysis.data_age import DataAge, use_shares
 from chainshaper.analysis.graph import with_possible_hand_overs
-from chainshaper.analysis.latency import (
-    PERCENTILES,
-    LatencyStatistics,
-    Longest,
-    latency_statistics,
-    longest_times,
-)
+from chainshaper.analysis.latency import Longest, longest_times
 from chainshaper.analysis.loop_rates import LoopRate, loop_instances, loop_label, loop_rates
+from chainshaper.analysis.statistics import PERCENTILES, LatencyStatistics, latency_statistics
 from chainshaper.control.plant_file import load_loop
 from chainshaper.sources import open_source, with_declared
 from chainshaper.values.durations import duration_text

@@ -32,14 +32,10 @@ from chainshaper.analysis import (
 )
 from chainshaper.analysis.data_age import count_uses, data_age, use_shares
 from chainshaper.analysis.disturbance import Due, with_punctuality
-from chainshaper.analysis.latency import (
-    LatencyStatistics,
-    Longest,
-    latency_statistics,
-    longest_times,
-)
+from chainshaper.analysis.latency import Longest, longest_times
 from chainshaper.analysis.messages import has_stampless
 from chainshaper.analysis.objects import Objects, resolve_objects
+from chainshaper.analysis.statistics import LatencyStatistics, latency_statistics
 from chainshaper.analysis.traversals import OWES_NO_OUTPUT, Traversals
 from chainshaper.enforcement.undoing import LoopState, find_runs
 from chainshaper.monitor.metrics import (

@@ -145,6 +145,8 @@ class Evidence(Part):
     lost_events: FromOne | None = None  # lost by the tracer
     all_disturbed: Literal[True] | None = None  # at most one cycle was undisturbed
     intra_process: Literal[True] | None = None  # subscribers get the output without DDS
+    # Those that a chain across several went over; its latencies are the upper ends of intervals.
+    hosts: tuple[str, ...] | None = None
     modes: "dict[ModeName, Evidence] | None" = None  # the same for the cycles in each mode
 
     @model_validator(mode="after")

@@ -563,6 +563,11 @@ def _about_evidence(plan: ChainPlan) -> Iterator[str]:
         text = "nothing says which mode was in force, so the modes share bands of them all"
         yield f"{text}: one that takes longer is late. Give each one's profile (--mode-profile)."
     evidence, cycle, margin = plan.evidence, plan.cycle_ns, plan.margin
+    if evidence.hosts:
+        text = (
+            f"the chain goes over {', '.join(evidence.hosts)}: its latencies count with the upper"
+        )
+        yield f"{text} ends of their intervals. Nothing puts such a plan in force yet."
     longest, used = evidence.max_latency_ns, evidence.utilisation or 0.0
     last = max((end for _, end in plans.publish_slots(plan)), default=longest)
     if evidence.realtime is False:

@@ -183,6 +183,7 @@ class Profile:
     unpublished: int = 0  # those of them that the application ended without a publication
     disturbed: int = 0  # cycles that the machine disturbed
     realtime: bool | None = None  # whether the chain ran with SCHED_FIFO
+    hosts: tuple[str, ...] | None = None  # those that a chain across several went over
     longest_stall_ns: int | None = None  # of the machine, during the recording
     lost_events: int | None = None  # lost by the tracer
     all_disturbed: bool | None = None  # whether at most one cycle was undisturbed

@@ -19,6 +19,7 @@ from chainshaper.analysis import (
     latency_statistics,
 )
 from chainshaper.analysis.data_age import DataAge
+from chainshaper.analysis.host_clocks import BoundedStatistics
 from chainshaper.planning import ChainPlan, publish_slots
 from chainshaper.planning.overruns import expected
 from chainshaper.reporting.tables import (
@@ -29,6 +30,7 @@ from chainshaper.reporting.tables import (
     counted,
     counts,
     figures,
+    interval_ms,
     min_mean_max,
     ms,
     percent,
@@ -37,6 +39,7 @@ from chainshaper.reporting.tables import (
 )
 from chainshaper.values.durations import duration_text, milliseconds
 from chainshaper.values.files import write_whole
+from chainshaper.values.hosts import Interval
 from chainshaper.verify.measure import PARTS, Comparison, Measurement, hop_breakdown, part_shares
 from chainshaper.verify.overruns import (
     dropped_text,
@@ -50,6 +53,9 @@ from chainshaper.verify.promises import outputs_due
 
 LATE = ("came late", "maximum", "jitter (max − min)")
 """The rows of all cycles that disturbed cycles change."""
+
+BETWEEN_HOSTS_NS = 1_000
+"""A communication that is known no better than this is shown as an interval."""
 
 JSON_FORMAT = 1
 """Version of the JSON that `latency`, `compare` and `check` print.
@@ -67,13 +73,13 @@ CONVENTION = (
 def _rows(columns: Sequence[LatencyStatistics | None]) -> dict[str, list[str]]:
     """Make the rows of figures by their titles, with a cell for each column's statistics."""
     cells: dict[str, Callable[[LatencyStatistics], str]] = {
-        "average": lambda statistics: ms(statistics.mean_ns),
-        "minimum": lambda statistics: ms(statistics.min_ns),
-        "maximum": lambda statistics: ms(statistics.max_ns),
-        "jitter (max − min)": lambda statistics: ms(statistics.jitter_ns),
-        "spread p0.5–p99.5": lambda statistics: ms(statistics.spread_ns),
-        "median": lambda statistics: ms(statistics.percentiles_ns.get("50")),
-        "99th percentile": lambda statistics: ms(statistics.percentiles_ns.get("99")),
+        "average": lambda statistics: figure_ms(statistics, "mean_ns"),
+        "minimum": lambda statistics: figure_ms(statistics, "min_ns"),
+        "maximum": lambda statistics: figure_ms(statistics, "max_ns"),
+        "jitter (max − min)": lambda statistics: figure_ms(statistics, "jitter_ns"),
+        "spread p0.5–p99.5": lambda statistics: figure_ms(statistics, "spread_ns"),
+        "median": lambda statistics: figure_ms(statistics, "50"),
+        "99th percentile": lambda statistics: figure_ms(statistics, "99"),
         "cycles": lambda statistics: str(statistics.count),
         "came late": lambda statistics: (
             ABSENT if statistics.late is None else f"{statistics.late} of {statistics.count}"
@@ -83,6 +89,13 @@ def _rows(columns: Sequence[LatencyStatistics | None]) -> dict[str, list[str]]:
         title: [ABSENT if column is None else cell(column) for column in columns]
         for title, cell in cells.items()
     }
+
+
+def figure_ms(statistics: LatencyStatistics, name: str) -> str:
+    """A figure, or a percentile, in ms: between hosts as an interval, ``53.100 ± 0.200``."""
+    if isinstance(statistics, BoundedStatistics):
+        return interval_ms({**statistics.bounds_ns, **statistics.percentile_bounds_ns}[name])
+    return ms({**asdict(statistics), **statistics.percentiles_ns}.get(name))
 
 
 def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[str, Any]:
@@ -132,7 +145,9 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
             (pl.col(end) + info.clock_offset_ns).alias(f"{end}_ns") for end in ("start", "end")
         ]
         complete = analysis.traversals.filter("complete")
-        result["instances"] = complete.select(*times, "latency_ns", "disturbed").to_dicts()
+        columns = ["latency_ns", "disturbed"]
+        columns += [name for name in ("latency_low_ns", "latency_high_ns") if name in complete]
+        result["instances"] = complete.select(*times, *columns).to_dicts()
         if analysis.data_age is not None:
             times = [
                 (pl.col(end) + info.clock_offset_ns).alias(f"{end}_ns")
@@ -401,8 +416,9 @@ def _brief(statistics: LatencyStatistics, bands: int) -> str:
     """
     late = "" if statistics.late is None else f", {statistics.late} late"
     if bands > 1:
-        return f"longest {ms(statistics.max_ns)} ms{late}"
-    return f"jitter {ms(statistics.jitter_ns)} ms, spread {ms(statistics.spread_ns)} ms{late}"
+        return f"longest {figure_ms(statistics, 'max_ns')} ms{late}"
+    jitter, spread = (figure_ms(statistics, f"{name}_ns") for name in ("jitter", "spread"))
+    return f"jitter {jitter} ms, spread {spread} ms{late}"
 
 
 def _counts(measurements: Sequence[Measurement]) -> dict[str, list[str]]:
@@ -447,7 +463,7 @@ def headline(names: Sequence[str], measurements: Sequence[Measurement]) -> str:
     calm = [measurement.analysis.undisturbed for measurement in measurements]
     ends = [0, -1] if len(calm) > 1 else [0]
     jitter, average = (
-        " → ".join(f"{ms(getattr(calm[n], field))} ms ({names[n]})" for n in ends)
+        " → ".join(f"{figure_ms(calm[n], field)} ms ({names[n]})" for n in ends)
         for field in ("jitter_ns", "mean_ns")
     )
     text, judged = f"Jitter {jitter}; average {average}", measurements[-1].prediction
@@ -578,6 +594,7 @@ def breakdown_table(analysis: LatencyAnalysis) -> ResultTable:
     """
     frame = hop_breakdown(analysis)
     waits = frame["waiting_ns"].struct.field("max").fill_null(0).max()
+    between = _communication_intervals(analysis)
     shown = PARTS if waits else PARTS[:2]
     cycles = Column("cycles", footer=str(analysis.statistics.count), detail=True)
     columns = [Column("hop", words=True, footer="together"), cycles]
@@ -590,8 +607,32 @@ def breakdown_table(analysis: LatencyAnalysis) -> ResultTable:
         cells: list[str] = []
         for part in shown:
             cells += [*min_mean_max(row[f"{part}_ns"]), percent(row[f"{part}_share"])]
+        if (intervals := between.get(row["hop"])) is not None:
+            cells[:3] = map(interval_ms, intervals)
         table.add(f"{row['callback']} → {row['topic']}", row["count"], *cells)
     return table
+
+
+def _communication_intervals(
+    analysis: LatencyAnalysis,
+) -> dict[int, tuple[Interval, Interval, Interval]]:
+    """Return the least, mean and longest communication of each hop between hosts, as intervals."""
+    low, high = "communication_low_ns", "communication_high_ns"
+    if low not in analysis.hops.columns:
+        return {}
+    complete = analysis.traversals.filter("complete")
+    hops = analysis.hops.join(complete, on="traversal", how="semi").drop_nulls(low)
+    between = hops.filter((pl.col(high) - pl.col(low)).max().over("hop") > BETWEEN_HOSTS_NS)
+    rows = between.group_by("hop").agg(
+        pl.concat_list(
+            pl.col(column).min(), pl.col(column).mean().round().cast(pl.Int64), pl.col(column).max()
+        )
+        for column in (low, high)
+    )
+    return {
+        hop: ((lows[0], highs[0]), (lows[1], highs[1]), (lows[2], highs[2]))
+        for hop, lows, highs in rows.iter_rows()
+    }
 
 
 def incomplete_table(names: Sequence[str], measurements: Sequence[Measurement]) -> ResultTable:

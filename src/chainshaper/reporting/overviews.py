@@ -30,6 +30,7 @@ from chainshaper.reporting.tables import (
     cost_text,
     counted,
     figures,
+    interval_ms,
     listed,
     min_mean_max,
     ms,
@@ -41,6 +42,7 @@ from chainshaper.reporting.tables import (
 )
 from chainshaper.values.application import ApplicationGraph, Chain, trigger_text
 from chainshaper.values.durations import duration_text, format_duration, milliseconds
+from chainshaper.values.hosts import process_text
 from chainshaper.values.recording import (
     INFO_FILE,
     MachineReport,
@@ -93,8 +95,10 @@ def contents_json(
             "this recording has no checksums, so that damage to its files may go unseen:"
             " `chainshaper convert` writes one that has"
         )
+    clocks = {"clocks": [host.model_dump() for host in info.hosts]} if info.hosts else {}
     return {
         "source": info.source,
+        **clocks,
         "events": dict(event_counts(recording).iter_rows()),
         "lost": info.lost,
         "clock_offset_ns": info.clock_offset_ns,
@@ -108,8 +112,11 @@ def contents_json(
     }
 
 
-def contents_table(recording: Recording) -> tuple[ResultTable, ResultTable]:
-    """Make two tables of a recording: its system, and how often each event happened."""
+def contents_table(recording: Recording) -> tuple[ResultTable, ...]:
+    """Make two tables of a recording: its system, and how often each event happened.
+
+    Of a recording of several hosts there is a third, of their clocks.
+    """
     contents = contents_json(recording)
     system = ResultTable(str(recording.path), words("", ""))
     for title, value in (
@@ -118,7 +125,10 @@ def contents_table(recording: Recording) -> tuple[ResultTable, ResultTable]:
         ("RMW", contents["rmw"] or UNKNOWN),
         ("hosts", ", ".join(contents["hosts"]) or UNKNOWN),
         ("clock offset", f"{contents['clock_offset_ns']} ns to CLOCK_REALTIME"),
-        *((f"process {pid}", name) for pid, name in contents["processes"].items()),
+        *(
+            (f"process {process_text(int(pid), recording.info.hosts)}", name)
+            for pid, name in contents["processes"].items()
+        ),
     ):
         system.add(title, value)
     total = f"{sum(contents['events'].values()):,}"
@@ -126,7 +136,30 @@ def contents_table(recording: Recording) -> tuple[ResultTable, ResultTable]:
     events = ResultTable("Events", columns)
     for name, number in contents["events"].items():
         events.add(name, f"{number:,}")
-    return system, events
+    return (system, clocks_table(recording), events) if recording.info.hosts else (system, events)
+
+
+def clocks_table(recording: Recording) -> ResultTable:
+    """Make a table of how far each host's clock is ahead of the first one's."""
+    reference, *others = recording.info.hosts
+    columns = [*words("host"), *figures("ahead [ms]", "known to [ms]", "drift [ppm]", "jumps")]
+    columns += [*figures("messages there", "back"), *words("wall clocks' claim")]
+    table = ResultTable(f"Clocks against {reference.name}, by messages", columns)
+    for host in others:
+        low, high = host.drift_ppm
+        drift = f"{low:+.2f}" if low == high else f"{low:+.2f} to {high:+.2f}"
+        claim = "" if host.claimed_ns is None else f"{ms(host.claimed_ns)}: {host.claim_is}"
+        counts_of = (f"{host.messages_there:,}", f"{host.messages_back:,}")
+        table.add(
+            host.name,
+            interval_ms(host.offset_ns),
+            f"± {ms(host.width_ns / 2)}",
+            drift,
+            len(host.steps),
+            *counts_of,
+            claim,
+        )
+    return table
 
 
 def callback_rows(statistics: pl.DataFrame) -> list[dict[str, Any]]:

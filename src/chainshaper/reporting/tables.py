@@ -187,6 +187,14 @@ def ms(nanoseconds: float | None) -> str:
     return ABSENT if nanoseconds is None else milliseconds(nanoseconds)
 
 
+def interval_ms(interval: tuple[int, int]) -> str:
+    """Return an interval of ns in milliseconds: ``53.100 ± 0.200``; what is shown covers it."""
+    low, high = interval
+    middle = round((low + high) / 2, -3)
+    half = -(-max(high - middle, middle - low) // 1000) * 1000
+    return f"{milliseconds(middle)} ± {milliseconds(half)}"
+
+
 def cost_text(cost: float | None) -> str:
     """Return a cost with four figures: ``1.413``; ``unstable``; a dash for None."""
     if cost is None:

@@ -23,6 +23,9 @@ def open_source(
 ) -> Recording:
     """Open a recording's folder; or an LTTng trace (CTF 1.8), which may have several folders.
 
+    Recordings of several hosts, given one by one or as a folder in which they lie, are opened as
+    one (:mod:`~chainshaper.sources.several_hosts`). The first is the reference.
+
     ``progress`` gets the share that is done, from 0 to 1, and what is being done. ``through``
     declares what no event shows (:func:`~chainshaper.values.handed_over.parse_through`).
     Raises InputError: there is nothing that can be read, or ``through`` declares nothing.
@@ -42,21 +45,34 @@ def with_declared(recording: Recording, through: Through) -> Recording:
 def _opened(
     paths: Sequence[str | Path], progress: Callable[[float, str], None] | None
 ) -> Recording:
-    """Open a recording or a trace."""
+    """Open a recording, a trace, or those of several hosts as one."""
     if not paths:
         raise InputError("no recording given: name a recording's or a trace's folder")
     folders = [Path(path) for path in paths]
     recordings = [folder for folder in folders if (folder / INFO_FILE).exists()]
+    if len(folders) == 1 and not recordings:
+        of_hosts = sorted(path.parent for path in folders[0].glob(f"*/{INFO_FILE}"))
+        if len(of_hosts) > 1:
+            folders = recordings = of_hosts
     if len(folders) == 1:
         traced = (path.is_file() for path in folders[0].rglob("metadata"))
         if recordings or not any(traced):
             return open_recording(folders[0])
-    elif recordings:
-        raise InputError(f"{recordings[0]} is a recording, which cannot be opened beside others")
-    # The decoder is slow to import, and is needed for traces only.
-    from chainshaper.sources.lttng.trace import open_lttng_trace
+    # What reads several hosts, and the decoder, are slow to import, and seldom needed.
+    if recordings:
+        from chainshaper.sources.several_hosts import joint_recording
 
-    return open_lttng_trace(folders, progress)
+        joint = joint_recording([_opened([folder], progress) for folder in folders])
+        return replace(joint, path=Path(paths[0]))
+    from chainshaper.sources.lttng.trace import SeveralClocksError, open_lttng_trace
+
+    try:
+        return open_lttng_trace(folders, progress)
+    except SeveralClocksError as error:
+        from chainshaper.sources.several_hosts import joint_recording
+
+        of_clocks = [open_lttng_trace(of_clock, progress) for of_clock in error.folders]
+        return replace(joint_recording(of_clocks), path=Path(paths[0]))
 
 
 class Tracer(Protocol):

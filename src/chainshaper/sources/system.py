@@ -10,6 +10,7 @@ from typing import Any
 
 import polars as pl
 
+from chainshaper.linux.processes import boot_id
 from chainshaper.values.events import NODE_NAME, EventTables, table
 from chainshaper.values.middleware import rmw_of_vendor
 from chainshaper.values.recording import RecordingInfo
@@ -44,6 +45,7 @@ def info_of(
     known = pl.DataFrame({"version": [version for version in versions if version][:1]})
     return RecordingInfo(
         source=source,
+        boot=boot_id(),
         distribution=distribution_of({"rcl_init": known}, {}),
         rmw=facts.pop("rmw", None) or rmw_of_gids(tables),
         processes=processes_of(tables, names),

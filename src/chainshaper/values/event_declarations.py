@@ -17,8 +17,10 @@ FieldKind: TypeAlias = Literal[
     "address",  # of an object in the traced process; 64 bits, unsigned
     "count",  # 64 bits, unsigned
     "nanoseconds",  # 64 bits, signed
+    "instant",  # ns of CLOCK_MONOTONIC; 0 or less: none
     "number",  # 64 bits, signed
     "small number",  # 32 bits, signed
+    "thread",  # the kernel's number of one; 0: a core's idle thread
     "flag",  # 0 or 1: of a C `bool` in a register, only the lowest byte is defined
     "text",
     "gid",  # bytes of a DDS or RMW identifier
@@ -544,11 +546,11 @@ _SWITCHES = (
         "switches",
         (
             EventField("prev_comm", "text"),
-            EventField("prev_tid", "small number"),
+            EventField("prev_tid", "thread"),
             EventField("prev_prio", "small number"),
             EventField("prev_state", "number"),
             EventField("next_comm", "text"),
-            EventField("next_tid", "small number"),
+            EventField("next_tid", "thread"),
             EventField("next_prio", "small number"),
         ),
     ),
@@ -606,7 +608,7 @@ _OURS = (
             EventField("manager", "address", 0),
             EventField("function", "count", 1),  # place in MANAGER_FUNCTIONS
             EventField("thread_time", "nanoseconds", 2),  # when it returned
-            EventField("began", "nanoseconds", 3),
+            EventField("began", "instant", 3),
             EventField("thread_time_began", "nanoseconds", 4),
         ),
         recorded_by_library="arguments",
@@ -618,7 +620,7 @@ _OURS = (
         "thread_sleep",
         "messages",
         (
-            EventField("until", "nanoseconds", 0),  # 0: the call does not say it
+            EventField("until", "instant", 0),  # 0: the call does not say it
             EventField("call", "count", 1),  # place in SLEEPING_CALLS
             EventField("thread_time", "nanoseconds", presence="optional", record_place=2),
         ),
@@ -663,9 +665,9 @@ _OURS = (
         (
             EventField("callback", "address"),  # that the message came to
             EventField("source_timestamp", "nanoseconds"),  # of the message; CLOCK_REALTIME
-            EventField("arrival", "nanoseconds"),  # when the message came
-            EventField("origin", "nanoseconds"),  # the cycle's beginning, from which slots count
-            EventField("release", "nanoseconds"),  # when it was to leave; null: never
+            EventField("arrival", "instant"),  # when the message came
+            EventField("origin", "instant"),  # the cycle's beginning, from which slots count
+            EventField("release", "instant"),  # when it was to leave; null: never
             EventField("slot", "small number"),  # in which it left, from 0; null: in none
             EventField("cycles_waited", "small number"),  # 0: it left in its own cycle
             EventField("anchor", "text"),  # of `origin`: "stamp", or "cycle" (no usable stamp too)
@@ -679,7 +681,7 @@ _OURS = (
             # one of it, "overflowed" where newer ones needed the room, "discarded" as an overrun.
             # Null: it left.
             EventField("dropped", "text", presence="optional"),
-            EventField("published", "nanoseconds", presence="optional"),  # publishing returned
+            EventField("published", "instant", presence="optional"),  # publishing returned
             # For how long after the release neither the gate nor any other thread ran on its core,
             # since the machine itself stood still.
             EventField("stalled", "nanoseconds", presence="optional"),
@@ -718,6 +720,22 @@ _OURS = (
         (
             EventField("duration", "nanoseconds"),  # of the stretch
             EventField("cpu_time", "nanoseconds"),  # of one wake-up in it
+        ),
+    ),
+    # Of a joint recording of several hosts: from `time` on, by the reference's clock, instants of a
+    # host may truly have been so much earlier or later than they are recorded. No tracer emits it.
+    # Its last row is of the last message that says anything about the host's clock.
+    Event(
+        "host_clock",
+        "creation",
+        (
+            EventField("host", "small number"),  # its place in the recording's `hosts`
+            EventField("earlier", "nanoseconds"),
+            EventField("later", "nanoseconds"),
+            # Share, in 1e-9, by which a span of the host's time may be longer or shorter.
+            EventField("slack", "number"),
+            # In which of its clock's pieces; -1: between two of them.
+            EventField("piece", "small number"),
         ),
     ),
 )

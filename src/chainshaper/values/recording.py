@@ -36,6 +36,7 @@ from chainshaper.values.files import (
     rename_output,
     write_whole,
 )
+from chainshaper.values.hosts import HostInfo
 from chainshaper.values.notebook import notebook_html
 from chainshaper.values.parquet import PackedColumns, is_packable, packed
 from chainshaper.values.yaml_file import wrong_values_refused
@@ -110,6 +111,8 @@ class RecordingInfo(BaseModel, frozen=True):
     source: str  # live, simulated, lttng, preload, ebpf
     host: str = Field(default_factory=platform.node)
     kernel: str = Field(default_factory=platform.release)
+    hosts: tuple[HostInfo, ...] = ()  # of a joint recording, the reference first; (): one host
+    boot: str | None = None  # the host's boot id; None: not known
     distribution: str | None = None  # of ROS 2
     rmw: str | None = None
     clock_offset_ns: Integer  # added to the time of an event, it is CLOCK_REALTIME

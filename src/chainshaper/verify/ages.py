@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from chainshaper.analysis.data_age import DataAge
-from chainshaper.analysis.latency import LatencyStatistics, latency_statistics
+from chainshaper.analysis.statistics import LatencyStatistics, latency_statistics
 from chainshaper.planning.chain_plan import PlannedLoop
 from chainshaper.values import events
 from chainshaper.values.durations import milliseconds

@@ -58,8 +58,8 @@ def profile_of(
     chains that are profiled, with their branches; the rest is as for :func:`.profile_chains`.
     """
     graph, chain = analysis.graph, analysis.chain
-    cycles = _cycles(recording, analysis)
-    period = _period(analysis, period_ns)
+    cycles = complete_cycles(recording, analysis)
+    period = period_of(analysis, period_ns)
     simulated = _nodes_in_simulated_time(flow, analysis)
     nodes = taking_part(graph, chain, stages)
     executors = executors_of_chain(recording, flow, graph, stages)
@@ -125,7 +125,7 @@ def profile_of(
 
 
 @dataclass(frozen=True)
-class _Cycles:
+class Cycles:
     """The complete traversals of a chain."""
 
     every: pl.DataFrame
@@ -134,7 +134,7 @@ class _Cycles:
     all_disturbed: bool  # whether fewer than two are undisturbed: times are taken of all
 
 
-def _cycles(recording: Recording, analysis: LatencyAnalysis) -> _Cycles:
+def complete_cycles(recording: Recording, analysis: LatencyAnalysis) -> Cycles:
     """Return the complete traversals. Raises OperationError: there are fewer than two."""
     every = analysis.traversals.filter("complete")
     if every.height < 2:
@@ -145,8 +145,8 @@ def _cycles(recording: Recording, analysis: LatencyAnalysis) -> _Cycles:
         )
     calm = every.filter(~pl.col("disturbed"))
     if calm.height < 2:
-        return _Cycles(every, every, every.clear(), all_disturbed=True)
-    return _Cycles(every, calm, every.filter("disturbed"), all_disturbed=False)
+        return Cycles(every, every, every.clear(), all_disturbed=True)
+    return Cycles(every, calm, every.filter("disturbed"), all_disturbed=False)
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ def _steps(
     return _ProfiledSteps(of_chain, graph_steps(flow, analysis, stages, core_of, planned))
 
 
-def _period(analysis: LatencyAnalysis, given: int | None) -> int:
+def period_of(analysis: LatencyAnalysis, given: int | None) -> int:
     """Return the period of a chain (ns): of the timer that starts it, else as ``given``.
 
     Raises InputError: it is not known, or known and given as well, or not positive.

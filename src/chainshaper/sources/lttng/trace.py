@@ -54,11 +54,26 @@ _GROUPS = tuple(events_in_group(group) for group in get_args(EventGroup))
 _WHO_RUNS = ("callback_start", "rmw_publish", "rmw_take", "rclcpp_publish")
 
 
+class SeveralClocksError(InputError):
+    """The folders of a trace were taken by several clocks: of several hosts, or boots of one.
+
+    ``folders`` are those of each clock.
+    """
+
+    def __init__(self, folders: tuple[tuple[Path, ...], ...]) -> None:
+        self.folders = folders
+        (first, *_), (another, *_), *_ = folders
+        super().__init__(
+            f"{another} was taken by another clock than {first} (another machine or boot): their"
+            " times cannot be compared; give the folders of one recording"
+        )
+
+
 def open_lttng_trace(paths: Sequence[str | Path], progress: Progress | None = None) -> Recording:
     """Open the LTTng trace in ``paths``: folders of one recording, searched recursively.
 
-    Raises InputError: no trace there, metadata that cannot be understood, or times that cannot be
-    compared.
+    Raises InputError: no trace there, metadata that cannot be understood. SeveralClocksError: it is
+    of several hosts.
     """
     progress = progress or (lambda _, __: None)
     progress(0.0, "opening the trace")
@@ -70,12 +85,11 @@ def open_lttng_trace(paths: Sequence[str | Path], progress: Progress | None = No
     except OSError as error:
         raise OperationError(f"the trace cannot be read: {error}") from error
     first = trace.folders[0]
-    for folder in trace.folders[1:]:
-        if None not in (clocks := {first.clock.uuid, folder.clock.uuid}) and len(clocks) == 2:
-            raise InputError(
-                f"{folder.path} was taken by another clock than {first.path} (another machine or "
-                "boot): their times cannot be compared; give the folders of one recording"
-            )
+    by_clock: dict[object, list[Path]] = {}
+    for folder in trace.folders:
+        by_clock.setdefault(folder.clock.uuid, []).append(folder.path)
+    if len(by_clock) > 1 and None not in by_clock:
+        raise SeveralClocksError(tuple(map(tuple, by_clock.values())))
     refuse_same_events(trace)
     tables = TraceTables(_by_host(trace, paths), progress)
     creation, hosts = tables.creation(), {_fact(folder, "hostname") for folder in trace.folders}
@@ -86,6 +100,7 @@ def open_lttng_trace(paths: Sequence[str | Path], progress: Progress | None = No
     info = RecordingInfo(
         source="lttng",
         host=", ".join(sorted(host for host in hosts if host)),
+        boot=None if first.clock.uuid is None else str(first.clock.uuid),
         kernel=next(filter(None, kernels), "unknown"),
         distribution=distribution_of(creation, tables.fields, tables.gid_length()),
         rmw=rmw_of_gids(creation) or rmw_of_threads(tables.thread_names()),
