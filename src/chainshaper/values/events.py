@@ -36,6 +36,7 @@ _TYPES: dict[FieldKind, pl.DataType] = {
     "nanoseconds": pl.Int64(),
     "number": pl.Int64(),
     "small number": pl.Int32(),
+    "real": pl.Float64(),
     "flag": pl.Int32(),
     "text": pl.String(),
     "gid": pl.List(pl.UInt8()),
