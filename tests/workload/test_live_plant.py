@@ -10,7 +10,7 @@ from chainshaper.verify.live_control import LiveCost, live_cost
 from chainshaper.workload.description import Application, application_as_written, load_application
 from chainshaper.workload.event_log import EventLog
 from chainshaper.workload.live import ProcessLog, event_tables
-from chainshaper.workload.live_plant import LiveLoop, carried_bytes
+from chainshaper.workload.live_plant import LiveLoop, LivePlant, carried_bytes
 
 MS = 1_000_000
 PERIOD = 50 * MS
@@ -30,8 +30,7 @@ def recorded(application: Application, latencies: np.ndarray, folder, pid: int =
     written = application.control_loop
     assert written is not None
     live, log, now = LiveLoop.described(written, PERIOD, application.seed), EventLog(), [0]
-    plant, controller = live.plant(log), live.controller()
-    plant._clock = lambda: now[0]
+    plant, controller = LivePlant(live, log, clock=lambda: now[0]), live.controller()
     samples = np.arange(len(latencies)) * PERIOD
     happens = [(int(at), 1, number) for number, at in enumerate(samples)]
     happens += [
@@ -49,7 +48,7 @@ def recorded(application: Application, latencies: np.ndarray, folder, pid: int =
         else:
             plant.drive(memoryview(inputs[number] + bytes(16)))
     tables = event_tables([ProcessLog(pid, None, log.rows, tuple(log.objects))], 0)
-    info = RecordingInfo(source="live", application=application_as_written(application))
+    info = RecordingInfo(source="live", clock_offset_ns=0, application=application_as_written(application))
     return write_recording(folder, tables, info)
 
 
@@ -110,7 +109,7 @@ def test_an_unstable_loop_costs_without_bound(tmp_path) -> None:  # type: ignore
 
 
 def test_a_recording_without_a_plant_has_no_cost(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    info = RecordingInfo(source="live")
+    info = RecordingInfo(source="live", clock_offset_ns=0)
     assert live_cost(write_recording(tmp_path / "rec", {}, info)) is None
 
 
