@@ -12,8 +12,8 @@ def solve_lyapunov(transition: Matrix, noise: Matrix) -> Matrix:
     """Return P = M·P·Mᵀ + N for a transition M (n x n) of spectral radius below 1, and N (n x n).
 
     It is the sum of Mᵏ·N·Mᵏᵀ over all k, of twice as many terms in each step (R. A. Smith, SIAM
-    Journal on Applied Mathematics 16(1), 1968). Of positive semidefinite N all terms are so: nothing
-    cancels, whatever units the states have, where SciPy's direct solution warns of an
+    Journal on Applied Mathematics 16(1), 1968). Of positive semidefinite N all terms are so:
+    nothing cancels, whatever units the states have, where SciPy's direct solution warns of an
     ill-conditioned matrix.
     """
     total, power = noise, transition

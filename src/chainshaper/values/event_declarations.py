@@ -711,9 +711,9 @@ _OURS = (
     ),
     # The machine stood still: a sleeper on core `cpu` woke up late. `time` is when it should have.
     Event("machine_stall", "messages", (EventField("duration", "nanoseconds"),)),  # how late
-    # The plant of the live workload's control loop was sampled, or its input changed. `cost` is what
-    # the time since the event before it cost: the integral of the loop's quadratic cost, averaged
-    # over copies of the plant, expected from their states when that time began.
+    # The plant of the live workload's control loop was sampled, or its input changed. `cost` is
+    # what the time since the event before it cost: the integral of the loop's quadratic cost,
+    # averaged over copies of the plant, expected from their states when that time began.
     Event(
         "plant_step",
         "messages",

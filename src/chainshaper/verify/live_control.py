@@ -117,8 +117,8 @@ def _run(loop: Loop, flows: Flows, steps: pl.DataFrame) -> _Run | None:
     computed = cost_of_events(loop, happened, begin, flows)
     # A step's cost is that of the time before it, which belongs to the sample before.
     cycle = np.cumsum((steps["step"] == "sampled").to_numpy()) - 1
-    measured = np.bincount(cycle[:-1], steps["cost"].to_numpy()[1:], minlength=sampled.height)
+    weights = steps["cost"].to_numpy()[1:]
+    measured = np.bincount(cycle[:-1], weights, minlength=sampled.height).astype(np.float64)
     return _Run(
         measured, computed.costs, computed.durations_s, computed.cost, len(latencies) - len(came)
     )
-

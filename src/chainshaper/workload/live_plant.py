@@ -1,9 +1,9 @@
 """The plant and the controller of a live run, each in its node: with noise that is drawn.
 
 The plant's state is carried exactly from event to event (:mod:`chainshaper.control.flows`). An
-event is a sample, or an input that arrives, at the instant at which its callback runs. The noise between two events has its exact covariance; what the time
-between them costs is the expectation from the state at its beginning, so that the integral is exact
-too, but for chance.
+event is a sample, or an input that arrives, at the instant at which its callback runs. The noise
+between two events has its exact covariance; what the time between them costs is the expectation
+from the state at its beginning, so that the integral is exact too, but for chance.
 
 A loop may have several copies of the plant, each with noise of its own: one message carries the
 samples, or the inputs, of all of them. So a short run says more about the average cost.
