@@ -8,7 +8,8 @@ import polars as pl
 import pytest
 from numpy.typing import NDArray
 
-from chainshaper.control.plant_file import LoopFile
+from chainshaper.control.plant_file import LoopFile, load_loop
+from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording, RecordingInfo, write_recording
 from chainshaper.verify.live_control import LiveCost, live_cost
 from chainshaper.workload.description import Application, application_as_written, load_application
@@ -18,7 +19,7 @@ from chainshaper.workload.live_plant import LiveLoop, LivePlant, carried_bytes
 
 MS = 1_000_000
 PERIOD = 100 * MS
-ROBOT = "examples/balancing_robot.yaml"
+ROBOT = str(Path(__file__).parents[2] / "examples" / "balancing_robot.yaml")
 NEVER = -1
 Numbers: TypeAlias = NDArray[np.int64]
 
@@ -128,3 +129,45 @@ def test_both_nodes_begin_in_the_same_states() -> None:
     first, second = (LiveLoop.described(written, PERIOD, 7).first for _ in range(2))
     assert (first == second).all()
     assert first.std() > 0
+
+
+@pytest.mark.parametrize(
+    ("was", "becomes", "reason"),
+    [
+        (", control: drives", "", "no callback has its part `control: drives`"),
+        ("{subscription: /torque, control: drives}", "{timer: 1s}", "part `control: drives`"),
+        ("{timer: 100ms, control: samples", "{timer: 100ms, control: drives", "write `subscrip"),
+        ("control: computes", "control: drives", "a second callback that drives"),
+        ("  copies: 64", "  copies: 0", "greater than or equal to 1"),
+        ("  copies: 64", "  period: 50ms", "the chain's period is 100 ms"),
+        ("denominator: [1, 0, -9]", "denominator: [1]", "denominator"),
+        ("numerator: [1]", "numerator: [1, 0, 0]", "not strictly proper"),
+        ("    priority: 85", "    executor: multi_threaded\n    threads: 2", "single-threaded"),
+    ],
+)
+def test_a_loop_that_does_not_close_is_refused(
+    was: str, becomes: str, reason: str, tmp_path: Path
+) -> None:
+    text = Path(ROBOT).read_text()
+    assert was in text
+    path = tmp_path / "robot.yaml"
+    path.write_text(text.replace(was, becomes))
+    with pytest.raises(InputError, match=reason):
+        load_application(path)
+
+
+def test_a_part_without_a_loop_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "robot.yaml"
+    begin, _, end = Path(ROBOT).read_text().partition("control_loop:")
+    path.write_text(begin + "nodes:" + end.partition("nodes:")[2])
+    with pytest.raises(InputError, match="an application with a `control_loop`"):
+        load_application(path)
+
+
+def test_an_applications_file_is_one_of_its_loop(tmp_path: Path) -> None:
+    loop = load_loop(ROBOT)
+    assert loop.delay_ns == 66 * MS
+    path = tmp_path / "robot.yaml"
+    path.write_text(Path(ROBOT).read_text().replace("delay: 66ms", "delay: 66"))
+    with pytest.raises(InputError, match=r"robot.yaml:\d+: control_loop.controller.delay"):
+        load_loop(path)
