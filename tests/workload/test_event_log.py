@@ -18,6 +18,7 @@ from chainshaper.workload.event_log import (
     WORDS,
     EventLog,
     number_of,
+    number_of_real,
 )
 from chainshaper.workload.launcher import send_events
 from chainshaper.workload.live import ProcessLog, event_tables
@@ -39,6 +40,9 @@ def test_every_event_is_read_back_as_it_was_recorded(entry: str, fields: tuple[s
     values = dict(zip(fields, range(1, len(fields) + 1), strict=True))
     values |= {field: len(words) - 1 for field, words in WORDS.items() if field in fields}
     values |= {field: number for field, number in (("mode", 0), ("taken", 1)) if field in fields}
+    if entry == "plant_step":
+        reals = {"cost": 0.5, "output": -1e-9, "input": 3.0}
+        values |= {field: number_of_real(value) for field, value in reals.items()}
     log.point(entry)(5000, *values.values())
     tables = event_tables([_process(log)], from_ns=0)
 
@@ -50,6 +54,8 @@ def test_every_event_is_read_back_as_it_was_recorded(entry: str, fields: tuple[s
         expected["dropped"] = "discarded"
     if entry == "asynchronous_send":
         expected["outcome"] = "overwritten"
+    if entry == "plant_step":
+        expected |= {"step": "driven", "cost": 0.5, "output": -1e-9, "input": 3.0}
     for name, table in tables.items():
         types = _types(name, fields)
         assert dict(table.schema) == types

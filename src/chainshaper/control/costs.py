@@ -122,7 +122,7 @@ def cost_of_events(
     cost = float(costs.sum() / durations.sum())
     if not np.isfinite(cost) or not np.isfinite(grown) or grown > ENDLESS * usual:
         cost = float("inf")
-    return SequenceCost(cost, _margin(costs, durations), costs, durations, last)
+    return SequenceCost(cost, margin_of(costs, durations), costs, durations, last)
 
 
 def cost_over(
@@ -147,8 +147,10 @@ def sampling(loop: Loop) -> tuple[Matrix, Matrix]:
     return np.ascontiguousarray(rows), np.ascontiguousarray(noise)
 
 
-def _margin(costs: NDArray[np.float64], durations_s: NDArray[np.float64]) -> float:
+def margin_of(costs: NDArray[np.float64], durations_s: NDArray[np.float64]) -> float:
     """Return half of the 95 % interval of a long sequence's cost, from averages of batches.
+
+    ``costs`` are of cycles, not per second. NaN: there are too few, or the costs have no bound.
 
     Cycles that follow each other depend on each other; batches of many hardly do.
     """

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from chainshaper import _core
 from chainshaper.control.costs import Events, sampling
 from chainshaper.control.flows import Flow, Flows
-from chainshaper.control.loop import Loop, Matrix
+from chainshaper.control.loop import Loop, Matrix, root_of
 
 
 class Drawn(NamedTuple):
@@ -22,13 +22,6 @@ class Drawn(NamedTuple):
     times_s: NDArray[np.float64]
     outputs: NDArray[np.float64]  # event x output, of the first run
     inputs: NDArray[np.float64]  # event x input that is applied, of the first run
-
-
-def root_of(covariance: Matrix) -> Matrix:
-    """Return a matrix whose product with its transpose is this covariance."""
-    sizes, directions = np.linalg.eigh(covariance)
-    root: Matrix = directions * np.sqrt(np.clip(sizes, 0.0, None))
-    return root
 
 
 def draw(

@@ -66,6 +66,13 @@ def covariance(values: ArrayLike, size: int, name: str) -> Matrix:
     return symmetric
 
 
+def root_of(covariance: Matrix) -> Matrix:
+    """Return a matrix whose product with its transpose is this covariance."""
+    sizes, directions = np.linalg.eigh(covariance)
+    root: Matrix = directions * np.sqrt(np.clip(sizes, 0.0, None))
+    return root
+
+
 @dataclass(frozen=True)
 class Plant:
     """A continuous, linear, strictly proper plant; checked.

@@ -14,7 +14,8 @@ import numpy as np
 
 from chainshaper.control.design import design_controller, periods_of_delay
 from chainshaper.control.flows import Flows
-from chainshaper.control.loop import Loop, Problem, scipy_linalg
+from chainshaper.control.loop import Loop, Problem
+from chainshaper.control.lyapunov import solve_lyapunov
 from chainshaper.control.steady_state import STABLE, steady_period
 from chainshaper.values.errors import InputError
 
@@ -42,13 +43,12 @@ def mode_costs(problem: Problem, latencies_ns: Mapping[str, int]) -> ModeCosts:
         except InputError as error:
             raise InputError(f"mode {mode}: {error}") from error
         steady[mode] = steady_period(Loop(problem, controller), latency_ns / 1e9, remembered, flows)
-    linalg = scipy_linalg()
     covariance, value, cost = {}, {}, {}
     for mode, (whole, noise, weights, noise_cost) in steady.items():
         if np.abs(np.linalg.eigvals(whole)).max() >= STABLE:
             raise InputError(f"mode {mode}: no controller stabilises it: leave it out")
-        covariance[mode] = linalg.solve_discrete_lyapunov(whole, noise)
-        value[mode] = linalg.solve_discrete_lyapunov(whole.T, weights)
+        covariance[mode] = solve_lyapunov(whole, noise)
+        value[mode] = solve_lyapunov(whole.T, weights)
         per_period = float(np.trace(weights @ covariance[mode]) + noise_cost)
         cost[mode] = per_period / problem.period_s
     switching = {

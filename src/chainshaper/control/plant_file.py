@@ -15,6 +15,9 @@ input; ``process_state`` that of noise on the states. ``output``, ``state`` and 
 the squares of these cost per second; a number, a list for a diagonal, or a matrix. ``measurement``
 is the variance of each sample. ``gains`` are those of u = −gains·y. ``modes`` are latencies; each
 mode has a controller for its own.
+
+The description of an application may contain one, under `control_loop`: then live runs have such a
+plant, or as many ``copies`` of it, each with noise of its own, that the same messages control.
 """
 
 from dataclasses import dataclass, replace
@@ -47,6 +50,7 @@ Weights: TypeAlias = Number | Row | Rows
 
 MADE_BY = "the description of a control loop (docs/control.md)"
 MOST_COEFFICIENTS = 25
+MOST_COPIES = 1_000
 
 
 class _Matrices(Part):
@@ -137,6 +141,7 @@ class LoopFile(Part):
     period_ns: PositiveDuration | None = None
     controller: ControllerPart
     modes: dict[str, Duration] = Field(default_factory=dict)
+    copies: int = Field(default=1, ge=1, le=MOST_COPIES)
 
 
 @dataclass(frozen=True)
@@ -193,19 +198,24 @@ class LoopDescription:
 
 
 def load_loop(path: str | Path) -> LoopDescription:
-    """Read the description of a control loop.
+    """Read the description of a control loop, or of an application that has one.
 
     Raises InputError: as :func:`.read_model`, or sizes do not match, the plant is not strictly
     proper, or noise or cost is negative.
     """
-    written = read_model(path, LoopFile, made_by=MADE_BY)
+    written = read_model(path, LoopFile, made_by=MADE_BY, under="control_loop")
     try:
-        return _described(Path(path), written)
+        return described_loop(Path(path), written)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
 
-def _described(path: Path, written: LoopFile) -> LoopDescription:
+def described_loop(path: Path, written: LoopFile) -> LoopDescription:
+    """Return the loop that is written in a file, which messages call ``path``.
+
+    Raises InputError: sizes do not match, the plant is not strictly proper, or noise or cost is
+    negative.
+    """
     plant = _plant(written.plant)
     n, m, outputs = plant.states, plant.inputs, plant.outputs
     noise = np.zeros((n, n))

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from chainshaper.control.costs import NEVER, sampling
 from chainshaper.control.flows import Flow, Flows
-from chainshaper.control.loop import Loop, Matrix, scipy_linalg
+from chainshaper.control.loop import Loop, Matrix
+from chainshaper.control.lyapunov import solve_lyapunov
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError
 
@@ -114,7 +115,7 @@ def cost_of_constant(loop: Loop, latency_s: float, flows: Flows | None = None) -
     )
     if np.abs(np.linalg.eigvals(whole)).max() >= STABLE:
         return float("inf")
-    covariance = scipy_linalg().solve_discrete_lyapunov(whole, noise)
+    covariance = solve_lyapunov(whole, noise)
     return float((np.trace(weights @ covariance) + noise_cost) / loop.problem.period_s)
 
 
@@ -128,7 +129,7 @@ def covariance_of_constant(loop: Loop, latency_s: float, flows: Flows | None = N
     known = loop.slices(1)["controller"].stop
     if np.abs(np.linalg.eigvals(whole)).max() >= STABLE:
         return np.zeros((known, known))
-    behind = scipy_linalg().solve_discrete_lyapunov(whole, noise)
+    behind = solve_lyapunov(whole, noise)
     # Carry it through the period, up to the next sample.
     period = loop.problem.period_s
     slots = int(latency_s / period + 1e-9)
@@ -340,13 +341,11 @@ def _directions(rows: Matrix) -> Matrix:
 
 def _symmetric_product(left: Matrix, right: Matrix, upper: tuple[NDArray[np.intp], ...]) -> Matrix:
     """Return the map P → left·P·rightᵀ between upper halves, its result made symmetric."""
-    n = len(left)
     row, column = upper
     # Column (i, j) of the map is left·(Eᵢⱼ + Eⱼᵢ)·rightᵀ, or left·Eᵢᵢ·rightᵀ.
     images = left[:, None, row] * right[None, :, column]
     twin = left[:, None, column] * right[None, :, row]
     images = np.where(row == column, images, images + twin)
     images = (images + np.swapaxes(images, 0, 1)) / 2
-    del n
     result: Matrix = images[row, column]
     return result

@@ -22,6 +22,7 @@ from chainshaper.analysis.data_age import DataAge
 from chainshaper.analysis.host_clocks import BoundedStatistics
 from chainshaper.planning import ChainPlan, publish_slots
 from chainshaper.planning.overruns import expected
+from chainshaper.reporting.live_control import live_cost_json, live_costs
 from chainshaper.reporting.tables import (
     ABSENT,
     YES_NO,
@@ -161,8 +162,11 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
 def comparison_json(comparison: Comparison) -> dict[str, Any]:
     """A comparison as plain data, one entry per recording."""
     entries = []
-    for measurement in comparison.measurements:
+    costs = live_costs(comparison.measurements)
+    for measurement, cost in zip(comparison.measurements, costs, strict=True):
         entry = {"recording": str(measurement.recording.path), **latency_json(measurement)}
+        if cost is not None:
+            entry["control"] = live_cost_json(cost)
         if measurement.plan is not None:
             entry["predicted"] = measurement.plan.predicted.model_dump(mode="json")
         if measurement.prediction is not None:

@@ -36,6 +36,7 @@ from chainshaper.reporting import latency as of_chain
 from chainshaper.reporting import overviews
 from chainshaper.reporting.cycle_parts import OPACITY, drawn_cycles, stacked_cycles
 from chainshaper.reporting.graph_drawing import timed_fold_svgs, timed_graph_svg
+from chainshaper.reporting.live_control import live_cost_table, live_costs, live_verdict
 from chainshaper.reporting.tables import ResultTable, figures, ms, slots_ms, words
 from chainshaper.reporting.timeline import Timeline, timeline_data, timeline_of
 from chainshaper.values.durations import duration_text
@@ -246,6 +247,7 @@ def _tables(parts: Sequence[_NamedMeasurement], suffix: str, several: bool) -> d
         "before_and_after": "Before and after" if len(parts) > 1 else "Figures",
         "comparison": of_chain.comparison_table(compared, names).html(),
         "predictions": "\n".join(map(_prediction, parts)),
+        "control": _control(names, measurements),
         "hops": "\n".join(hops),
         "graphs": "\n".join(map(_graph, parts)),
         "overruns": "\n".join(_overruns(part) + _moves(part) for part in parts),
@@ -349,6 +351,16 @@ def _prediction(part: _NamedMeasurement) -> str:
     if judged.counted_from == "cycle":
         about += " Times count from the start of the cycle."
     return _paragraph(about) + table.html()
+
+
+def _control(names: Sequence[str], measurements: Sequence[Measurement]) -> str:
+    """Make the HTML of what the control loop of live runs cost; empty: they had none."""
+    costs = live_costs(measurements)
+    if not any(costs):
+        return ""
+    table = live_cost_table(names, costs)
+    verdict = _paragraph(live_verdict(costs) or "", "verdict")
+    return f"{_paragraph(f'{table.title}: {table.caption}.')}{table.html()}{verdict}"
 
 
 def _callbacks(part: _NamedMeasurement) -> str:

@@ -15,6 +15,7 @@ from rich.text import Text
 from chainshaper.analysis import LatencyStatistics
 from chainshaper.planning import ChainPlan, publish_slots
 from chainshaper.planning.overruns import expected
+from chainshaper.reporting.live_control import live_costs, live_verdict
 from chainshaper.reporting.tables import ABSENT, percent
 from chainshaper.values.durations import duration_text, milliseconds
 from chainshaper.values.errors import shown
@@ -181,6 +182,8 @@ def unplanned_lines(before: Measurement, reason: str) -> list[Text]:
 def verdict_lines(before: Measurement, after: Measurement) -> list[Text]:
     """Say whether the outputs were as planned, and what the machine did meanwhile."""
     lines = [*_promise_lines(after), *_machine_lines(before, after)]
+    if (control := live_verdict(live_costs([before, after]))) is not None:
+        lines.append(_line("→", f"{control[0].upper()}{control[1:]}."))
     if False in (before.recording.info.realtime, after.recording.info.realtime):
         text = "Not all threads had SCHED_FIFO: run it as root, or with an `rtprio` limit."
         lines.append(_line("!", text))

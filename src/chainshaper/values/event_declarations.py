@@ -21,6 +21,7 @@ FieldKind: TypeAlias = Literal[
     "number",  # 64 bits, signed
     "small number",  # 32 bits, signed
     "thread",  # the kernel's number of one; 0: a core's idle thread
+    "real",  # a floating-point number of 64 bits
     "flag",  # 0 or 1: of a C `bool` in a register, only the lowest byte is defined
     "text",
     "gid",  # bytes of a DDS or RMW identifier
@@ -712,6 +713,20 @@ _OURS = (
     ),
     # The machine stood still: a sleeper on core `cpu` woke up late. `time` is when it should have.
     Event("machine_stall", "messages", (EventField("duration", "nanoseconds"),)),  # how late
+    # The plant of the live workload's control loop was sampled, or its input changed. `cost` is
+    # what the time since the event before it cost: the integral of the loop's quadratic cost,
+    # averaged over copies of the plant, expected from their states when that time began.
+    Event(
+        "plant_step",
+        "messages",
+        (
+            EventField("step", "text"),  # "sampled"; "driven": the input of a sample arrived
+            EventField("sample", "number"),  # its number in the run, from 0
+            EventField("cost", "real"),
+            EventField("output", "real"),  # the first one, of the first copy
+            EventField("input", "real"),  # the same, from now on
+        ),
+    ),
     # The pace of core `cpu`, by the CPU time of a sleeper's wake-ups, whose work is the same each
     # time: where it takes longer, the core is slower. `time` is when a stretch of them began.
     Event(

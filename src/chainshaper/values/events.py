@@ -38,6 +38,7 @@ _TYPES: dict[FieldKind, pl.DataType] = {
     "number": pl.Int64(),
     "small number": pl.Int32(),
     "thread": pl.Int32(),
+    "real": pl.Float64(),
     "flag": pl.Int32(),
     "text": pl.String(),
     "gid": pl.List(pl.UInt8()),
@@ -161,11 +162,13 @@ def column_problems(schema: Mapping[str, pl.DataType], name: str) -> list[str]:
 
 
 def castable(type_: pl.DataType | None, wanted: pl.DataType) -> bool:
-    """Whether values of a type can be cast to a column's: integers of another width can."""
+    """Whether values of a type can be cast to a column's: numbers of another width can."""
     if isinstance(wanted, pl.List):
         return isinstance(type_, pl.List | pl.Array) and type_.inner.is_integer()
     if wanted.is_integer() and type_ is not None:
         return type_.is_integer() or isinstance(type_, pl.Null)
+    if wanted.is_float() and type_ is not None:
+        return type_.is_numeric() or isinstance(type_, pl.Null)
     return isinstance(type_, pl.String | pl.Categorical | pl.Null)
 
 

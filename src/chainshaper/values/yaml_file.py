@@ -123,8 +123,12 @@ def read_model(
     model: type[Model],
     *,
     made_by: str,
+    under: str | None = None,
 ) -> Model:
     """Read a YAML file into a Pydantic model; ``made_by`` completes "such a file is …" in messages.
+
+    ``under`` is a key: where the file has it, the model is what stands there, and the rest of the
+    file is not looked at.
 
     Raises InputError: no such file, not YAML, or wrong values, each with its line, key, reason and
     remedy.
@@ -135,6 +139,9 @@ def read_model(
     if not isinstance(values, dict):
         problem = "the file is empty" if root is None else "expected a YAML mapping (key: value)"
         raise InputError(f"{path}:1: {problem}; such a file is {made_by}")
+    inside: _Path = ()
+    if under is not None and isinstance(values.get(under), dict):
+        inside, values = (under,), values[under]
     try:
         return model.model_validate(values, context=AS_YAML)
     except ValidationError as error:
@@ -143,7 +150,7 @@ def read_model(
             if keys <= values.keys() and not keys <= known:
                 reason = f"is {kind.format(path=path)}; wanted is a file {made_by}"
                 raise InputError(f"{path}: {reason}") from error
-        raise plain.problems(error, model) from error
+        raise plain.problems(error, model, inside) from error
 
 
 def read_text(path: Path, made_by: str) -> str:
@@ -271,10 +278,16 @@ class PlainData:
         line = node.start_mark.line + 1
         return InputError(f"{self.name}:{line}: {_key_text(where)}: {reason}")
 
-    def problems(self, error: ValidationError, model: type[BaseModel]) -> InputError:
-        """Make an error of all values that a model has refused, each with its line."""
+    def problems(
+        self, error: ValidationError, model: type[BaseModel], inside: _Path = ()
+    ) -> InputError:
+        """Make an error of all values that a model has refused, each with its line.
+
+        The model's values are those ``inside`` the file at this path.
+        """
         lines = []
-        for where, reason in _explanations(error, model):
+        for at, reason in _explanations(error, model):
+            where = (*inside, *at)
             # A missing key has no line, so that of the mapping from which it is missing counts.
             places = (where[:end] for end in range(len(where), -1, -1))
             line = next((self.lines[place] for place in places if place in self.lines), 1)

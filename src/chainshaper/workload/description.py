@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_origin
 
 from pydantic import Field, create_model, model_validator
 
+from chainshaper.control.plant_file import LoopFile, described_loop
 from chainshaper.robot.gate import Gate, GateModes, Late, limit_of
 from chainshaper.values.application import LOOP_END
 from chainshaper.values.errors import InputError
@@ -260,6 +261,10 @@ class CallbackDescription(Part):
     * ``publishes``: topics.
     * ``announces``: names of modes, which it publishes in turn, each as a ``std_msgs/String``.
     * ``gate``: it executes nothing, and forwards what it received in slots.
+    * ``control``: its part in the application's ``control_loop``, in a live run, when it starts:
+      a timer's that ``samples`` the plant, and publishes the samples; that of the controller, which
+      ``computes`` the plant's inputs from them, and publishes these; or it ``drives`` the plant
+      with the inputs that it gets. All other callbacks pass on what the first message carries.
     """
 
     timer_ns: PositiveDuration | None = None
@@ -278,6 +283,7 @@ class CallbackDescription(Part):
     publishes: tuple[FullName, ...] = ()
     announces: tuple[str, ...] = ()
     gate: GateDescription | None = None
+    control: Literal["samples", "computes", "drives"] | None = None
     group: str | None = None
 
     @property
@@ -322,9 +328,26 @@ class CallbackDescription(Part):
                 reason = "a callback that computes has no execution, afterwards, gate or announces:"
                 reason += " keep one"
                 raise wrong_value(reason, "computes")
+        self._check_control()
         if self.announces and len(self.publishes) != 1:
             raise wrong_value("modes are announced on exactly one topic", "announces")
         return self
+
+    def _check_control(self) -> None:
+        """Refuse a part in a control loop that this callback cannot have."""
+        if self.control is None:
+            return
+        if self.computes is not None or self.gate is not None or self.announces:
+            reason = "a callback that has a part in the control loop has no computes, gate or"
+            raise wrong_value(f"{reason} announces: keep one", "control")
+        if self.control == "samples" and self.timer_ns is None:
+            raise wrong_value("a timer's callback samples the plant: write `timer`", "control")
+        if self.control != "samples" and self.subscription is None:
+            reason = "is for what the messages of one topic carry: write `subscription`"
+            raise wrong_value(reason, "control")
+        if self.control != "drives" and not self.publishes:
+            reason = "what it samples or computes goes into its messages: write `publishes`"
+            raise wrong_value(reason, "control")
 
     def _check_loop(self) -> None:
         """Refuse what only a loop has elsewhere, and what a loop has not."""
@@ -451,7 +474,10 @@ class SchedulingOfApplication(Part):
 
 
 class Application(Part):
-    """A whole application. ``chain`` is the chain of interest, as ``FIRST..LAST``."""
+    """A whole application. ``chain`` is the chain of interest, as ``FIRST..LAST``.
+
+    ``control_loop`` is what a live run controls, as :mod:`chainshaper.control.plant_file` has it.
+    """
 
     name: str
     chain: str
@@ -459,6 +485,7 @@ class Application(Part):
     scheduling: SchedulingOfApplication
     topics: dict[FullName, TopicDescription] = Field(default_factory=dict)
     simulation: SimulationDescription = SimulationDescription()
+    control_loop: LoopFile | None = None
     nodes: dict[str, NodeDescription] = Field(min_length=1)
 
     @model_validator(mode="after")
@@ -493,6 +520,7 @@ class Application(Part):
             reason += f"{' → '.join(error.args[1])}; break it at one of these topics"
             raise wrong_value(reason, "nodes") from error
         self._check_simulation()
+        self._check_control_loop()
         return self
 
     def _check_simulation(self) -> None:
@@ -511,6 +539,38 @@ class Application(Part):
                     raise wrong_value(
                         f"{reason} remove it", "simulation", "deliveries", node, topic
                     )
+
+    def _check_control_loop(self) -> None:
+        """Refuse a control loop that does not close, and one that is not right."""
+        parts: dict[str, list[tuple[str, CallbackDescription]]] = {}
+        for name, node in self.nodes.items():
+            for number, callback in enumerate(node.callbacks):
+                if callback.control is None:
+                    continue
+                where = ("nodes", name, "callbacks", number, "control")
+                if self.control_loop is None:
+                    reason = "is for an application with a `control_loop`: describe it"
+                    raise wrong_value(reason, *where)
+                if node.threads > 1:
+                    raise wrong_value("needs a node with a single-threaded executor", *where)
+                if callback.control in parts:
+                    reason = f"a second callback that {callback.control}: keep one"
+                    raise wrong_value(reason, *where)
+                parts.setdefault(callback.control, []).append((name, callback))
+        if self.control_loop is None:
+            return
+        for part in ("samples", "computes", "drives"):
+            if part not in parts:
+                reason = f"no callback has its part `control: {part}`: write it to one"
+                raise wrong_value(reason, "control_loop")
+        (sampling, timer), (driving, _) = parts["samples"][0], parts["drives"][0]
+        if sampling != driving:
+            reason = f"node {sampling} samples the plant, and {driving} drives it: it is one plant,"
+            raise wrong_value(f"{reason} in one node", "control_loop")
+        try:
+            described_loop(Path("control_loop"), self.control_loop).problem(timer.timer_ns)
+        except InputError as error:
+            raise wrong_value(str(error), "control_loop") from error
 
     def _refuse_unpublished(
         self, callback: CallbackDescription, published: set[str], where: tuple[str | int, ...]
@@ -616,6 +676,12 @@ def origin_timer(
         remedy = "plan again from a recording of this application"
         raise InputError(f"the application {application.name!r} {lacks}: {remedy}")
     return next((name, callback) for name, callback in starts if callback.period_ns is not None)
+
+
+def loop_period_ns(application: Application) -> int:
+    """Return the period at which the control loop's plant is sampled; 0: there is none."""
+    sampling = (call for _, call in application.callbacks() if call.control == "samples")
+    return next((callback.timer_ns or 0 for callback in sampling), 0)
 
 
 def load_application(path: str | Path) -> Application:

@@ -14,6 +14,7 @@ from array import array
 from collections.abc import Callable
 from functools import partial
 from itertools import count
+from struct import Struct
 from threading import get_native_id
 from time import monotonic_ns
 from typing import Any
@@ -35,6 +36,7 @@ LAYOUT: dict[str, tuple[str, ...]] = {
     "machine_stall": ("duration",),
     "thread_sleep": ("until", "call", "thread_time"),
     "thread_wake": ("call", "thread_time"),
+    "plant_step": ("step", "sample", "cost", "output", "input"),
 }
 """Kinds of entries, and the order of their fields. The number of a kind is its place here."""
 ALSO_TAKEN = ("rcl_take", "rclcpp_take")  # only where a message was taken
@@ -50,17 +52,25 @@ WIDTH = 15  # numbers of an entry: its kind, time, thread, and up to twelve fiel
 BLOCK = 1_000 * WIDTH  # numbers in an array before the next one is begun
 
 ABSENT = -1  # stands for null
+_REAL, _REAL_BITS = Struct("<d"), Struct("<q")
 WORDS: dict[str, tuple[str, ...]] = {
     "anchor": ANCHORS,
     "overrun": LATE,
     "messages": MESSAGES,
     "dropped": DROPPED,
     "outcome": ("sent", "expired", "overwritten"),
+    "step": ("sampled", "driven"),
 }
 """Words are recorded as their places in these lists; a ``mode`` by its place among its gate's."""
 
 CLOCK_NANOSLEEP = SLEEPING_CALLS.index("clock_nanosleep")  # by which loops sleep
 FIRST_HANDLE = 0x55D0_0000_0100  # like a real address; other processes have the same
+
+
+def number_of_real(value: float) -> int:
+    """Return the number by which a floating-point number is recorded: the same 64 bits."""
+    bits: int = _REAL_BITS.unpack(_REAL.pack(value))[0]
+    return bits
 
 
 def number_of(field: str, word: str | None) -> int:

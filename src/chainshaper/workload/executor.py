@@ -327,23 +327,33 @@ start (ns). It returns the message for each topic, in the topics' order, or noth
 """
 
 
+NumbersOf: TypeAlias = Callable[[Sequence[dds.Message]], bytes]
+"""Gives the numbers of a control loop that a callback publishes, from the messages it gets."""
+
+
 def spending(
     times: ExecutionTimes,
     templates: Sequence[bytes],
     announced: list[bytes],
     *,
+    numbers_of: NumbersOf | None = None,
     beside_others: bool = False,
 ) -> Work:
     """Return work that spends the next execution time, and passes the first message's stamp on.
 
-    ``templates`` has the data for each topic. If messages are ``announced``, these are published in
-    turn instead. Messages are made first, so that making them is part of the execution time.
+    ``templates`` has the data for each topic; ``numbers_of`` gives what takes the place of their
+    first bytes. If messages are ``announced``, these are published in turn instead. Messages are
+    made first, so that making them is part of the execution time.
     """
     announcements = cycle(announced)
 
     def work(messages: Sequence[dds.Message], wall_ns: int, cpu_ns: int) -> Sequence[bytes]:
         stamp = (origin_of(messages[0].payload) or 0) if messages else wall_ns
-        made = [next(announcements, None) or dds.data_message(data, stamp) for data in templates]
+        numbers = b"" if numbers_of is None else numbers_of(messages)
+        made = [
+            next(announcements, None) or dds.data_message(numbers + data[len(numbers) :], stamp)
+            for data in templates
+        ]
         spend(times.next(), cpu_ns, beside_others=beside_others)
         return made
 

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from chainshaper.control.plant_file import described_loop
 from chainshaper.enforcement.journal import Governed, governing, in_force_throughout
 from chainshaper.linux.child_processes import LIBRARIES
 from chainshaper.linux.scheduling import (
@@ -53,11 +54,13 @@ from chainshaper.workload import launcher
 from chainshaper.workload.description import (
     Application,
     application_as_written,
+    loop_period_ns,
     node_name,
     origin_timer,
 )
 from chainshaper.workload.event_log import ABSENT, ALSO_TAKEN, EVENTS, LAYOUT, WIDTH, WORDS
 from chainshaper.workload.launcher import Child
+from chainshaper.workload.live_plant import LiveLoop, carried_bytes
 from chainshaper.workload.node_setup import Counterparts, NodeSetup
 from chainshaper.workload.stall_meter import StallWatch, far_from, meter_tables, stalls_watched
 from chainshaper.workload.timing import Timing, timing_of
@@ -124,6 +127,8 @@ def run_application(
     if cycles < 1:
         raise InputError(f"{cycles} cycles cannot be recorded: ask for at least 1")
     check_cores(application.cores())
+    if application.control_loop is not None:
+        LiveLoop.described(application.control_loop, loop_period_ns(application), application.seed)
     permitted = fifo_permitted(realtime)
     realtime = permitted if realtime is None else realtime
     run = _run(
@@ -358,6 +363,12 @@ def _setup_of(application: Application, name: str, domain: int, realtime: bool) 
     publishers = Counter(topic for callback in described for topic in callback.publishes)
     subscriptions = Counter(topic for callback in described for topic in callback.subscriptions)
     executor, dds = application.scheduling_of(name), application.dds_scheduling_of(name)
+    loop = application.control_loop
+    takes_part = any(callback.control for callback in application.nodes[name].callbacks)
+    carried = 0
+    if loop is not None:
+        plant = described_loop(Path("control_loop"), loop).plant
+        carried = carried_bytes(plant.outputs, plant.inputs, loop.copies)
     return NodeSetup(
         name=node_name(name),
         node=application.nodes[name],
@@ -373,6 +384,9 @@ def _setup_of(application: Application, name: str, domain: int, realtime: bool) 
         parent=os.getpid(),
         starts_chain=origin_timer(application)[0] == name,
         origin_phase_ns=origin_timer(application)[1].phase_ns,
+        control_loop=loop if takes_part else None,
+        loop_period_ns=loop_period_ns(application),
+        carried=carried,
         delivery_core=dds.core if realtime and dds.core != executor.core else None,
     )
 
@@ -567,6 +581,8 @@ def typed_table(name: str, frame: pl.DataFrame, modes: Sequence[str] = ()) -> pl
         column = frame[field]
         if column.dtype == pl.Int64 and types[field] == pl.UInt64:  # a handle
             column = column.reinterpret(signed=False)
+        if types[field] == pl.Float64:
+            column = pl.Series(field, column.to_numpy().view(np.float64))
         if field in words:
             named = dict(enumerate(words[field]))
             column = column.replace_strict(named, default=None, return_dtype=pl.String())

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from chainshaper.linux import scheduling
 from chainshaper.robot.handover import Turn
@@ -28,6 +28,9 @@ from chainshaper.workload.gate_callback import GateCallback, GateHandles, shaper
 from chainshaper.workload.loop import Loop
 from chainshaper.workload.node_setup import NodeSetup
 from chainshaper.workload.traced import TracedPublisher, traced_callback
+
+if TYPE_CHECKING:
+    from chainshaper.workload.live_plant import LiveLoop, LivePlant
 
 NEVER_S = 1e6
 KINDS = ("subscription", "service", "client")  # in the order in which executors look at them
@@ -60,6 +63,7 @@ class NodeProcess:
         self.shapers: list[tuple[Shaper, GateDescription]] = []
         self.execution_times: list[ExecutionTimes] = []
         self.loop: Loop | None = None
+        self._plant: LivePlant | None = None
         self._several = setup.node.threads > 1 or setup.node.loop is not None
         self.log.node(setup.name, "live workload")
         numbered = enumerate(setup.node.callbacks)
@@ -136,8 +140,43 @@ class NodeProcess:
             self._times(callback.execution, index),
             templates=[publisher.template for publisher in publishers],
             announced=[dds.text_message(mode) for mode in callback.announces],
+            numbers_of=self._numbers_of(callback),
             beside_others=self._several,
         )
+
+    def _numbers_of(self, callback: CallbackDescription) -> executor.NumbersOf | None:
+        """Return what gives the control loop's numbers that a callback publishes; None: nothing."""
+        carried, inputs = self.setup.carried, callback.inputs or callback.reads
+        if callback.control is not None:
+            return self._part_in_loop(callback.control)
+        if not carried or not inputs or inputs[0] in self.setup.announced:
+            return None
+        return lambda messages: (
+            bytes(dds.data_of(messages[0].payload)[:carried]) if messages else b""
+        )
+
+    def _part_in_loop(self, part: str) -> executor.NumbersOf:
+        """Return what a callback does in the control loop."""
+        if part == "computes":
+            compute = self._control_loop().controller().compute
+            return lambda messages: compute(dds.data_of(messages[0].payload))
+        plant = self._plant = self._plant or self._control_loop().plant(self.log)
+        if part == "samples":
+            return lambda _: plant.sample()
+
+        def drive(messages: Sequence[dds.Message]) -> bytes:
+            plant.drive(dds.data_of(messages[0].payload))
+            return b""
+
+        return drive
+
+    def _control_loop(self) -> "LiveLoop":
+        """Return the control loop: who has no part in it does not load what it needs."""
+        from chainshaper.workload.live_plant import LiveLoop
+
+        written = self.setup.control_loop
+        assert written is not None  # noqa: S101 - a node whose callbacks have a part in it gets it
+        return LiveLoop.described(written, self.setup.loop_period_ns, self.setup.seed)
 
     def _rest(self, index: int, afterwards: ExecutionTime | None) -> Callable[[], None]:
         """Return what a callback does after it has published: spend drawn times, or nothing."""

@@ -4,6 +4,7 @@ The launcher sends it as a line of JSON (:mod:`chainshaper.workload.launcher`), 
 reads back as the same validated model.
 """
 
+from chainshaper.control.plant_file import LoopFile
 from chainshaper.values.yaml_file import FullName, Part
 from chainshaper.workload.description import NodeDescription, TopicDescription
 
@@ -29,4 +30,7 @@ class NodeSetup(Part):
     parent: int  # pid of the launcher, with which the process ends
     starts_chain: bool  # whether its timer or loop does
     origin_phase_ns: int  # where cycles begin behind the start, for gates that do not say
+    control_loop: LoopFile | None  # where its callbacks have a part in it
+    loop_period_ns: int  # of the control loop; 0: the application has none
+    carried: int  # bytes of the control loop's numbers in each message
     delivery_core: int | None  # of DDS threads, if they are real-time and have a core of their own

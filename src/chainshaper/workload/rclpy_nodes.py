@@ -193,6 +193,7 @@ def _reasons(application: Application, callback: CallbackDescription) -> dict[st
     return {
         "gate": None if callback.gate is None else "a gate of its own",
         "computes": None if callback.computes is None else "a function that they do not call",
+        "control": "a part in a control loop" if callback.control is not None else None,
         "kind": None if callback.kind == "subscription" else f"of a {callback.kind}",
         "synchronises": "a set of messages" if callback.synchronises else None,
         "announces": "names of modes" if callback.announces else None,

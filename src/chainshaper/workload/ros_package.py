@@ -117,6 +117,8 @@ def _refuse(application: Application, place: str, callback: CallbackDescription)
         "computes": callback.computes is not None
         and "a function in Python, which no node in C++ calls; describe its `execution` instead, "
         "such as the `samples` of a recording",
+        "control": callback.control is not None
+        and "a part in a control loop, which live runs have only; remove it",
         "loop": callback.loop_ns is not None
         and "a thread of its own, which generated nodes have not; describe a `timer` instead",
         "kind": callback.kind != "subscription"
