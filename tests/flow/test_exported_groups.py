@@ -89,7 +89,9 @@ def test_best_effort_threads_have_nice_and_priority_for_old_and_new_versions(
         best_effort=True,
     )
     plan = Plan.of(bare_plan("/source../points", CYCLE_NS, server))
-    (entry,) = export_callback_groups(plan, _recording(tmp_path)).configuration.callback_groups or ()
+    (entry,) = (
+        export_callback_groups(plan, _recording(tmp_path)).configuration.callback_groups or ()
+    )
     assert (entry.policy, entry.priority, entry.nice) == ("SCHED_OTHER", 0, 0)
 
 
@@ -161,7 +163,9 @@ def test_a_configuration_tells_what_was_in_force_where_the_kernel_was_not_asked(
         tid=13, pid=1, comm="x", node="", role="executor", policy="SCHED_RR", priority=2, cores=(0,)
     )
     read, notes = with_callback_groups(_recording(tmp_path, has), configuration)
-    threads = {known.tid: (known.policy, known.priority, known.cores) for known in read.info.threads}
+    threads = {
+        known.tid: (known.policy, known.priority, known.cores) for known in read.info.threads
+    }
     assert threads == {
         11: ("SCHED_FIFO", 60, (1,)),
         12: ("SCHED_DEADLINE", 0, ()),
