@@ -135,7 +135,7 @@ def test_a_plan_names_the_thread_of_a_callback_group(tmp_path: Path) -> None:
     plan = _plan(Thread(node="/source"), thread)
     path = tmp_path / "plan.yaml"
     save_plan(plan, path)
-    assert f"{{callback_group: {FILTER}, role: executor}}" in path.read_text()
+    assert f"{{role: executor, callback_group: {FILTER}}}" in path.read_text()
     assert load_plan(path) == plan
     exported = export_callback_groups(load_plan(path), _recording(tmp_path))
     assert set(_entries(exported.configuration)) == {SOURCE, FILTER}

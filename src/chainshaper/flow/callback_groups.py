@@ -128,9 +128,9 @@ def _certain_groups(recording: Recording, nodes: Iterable[str]) -> list[Callback
     unsure = sorted({known.group.node for known in groups if not known.certain} & wanted)
     if unsure:
         raise OperationError(
-            f"{recording.path} does not show for sure which callback groups {', '.join(unsure)} has:"
-            " services, clients or callbacks that never ran may be in any; record for longer, or"
-            f" {_THEIR_FILE}"
+            f"{recording.path} does not show for sure which callback groups {', '.join(unsure)}"
+            " has: services, clients or callbacks that never ran may be in any; record for longer,"
+            f" or {_THEIR_FILE}"
         )
     return list(dict.fromkeys(known.group for known in groups if known.certain))
 
