@@ -42,13 +42,14 @@ def recorded_groups(flow: DataFlow) -> tuple[RecordedGroup, ...]:
     if not pids:
         return ()
     made = defaultdict[tuple[int, str], Counter[str]](Counter)  # by process and node
-    columns = ("pid", "node", "role", "topic")
-    for pid, node, role, name in endpoints(flow.events).select(columns).iter_rows():
+    ends = endpoints(flow.events).select("pid", "node", "role", "topic")
+    for pid, node, role, name in ends.iter_rows():
         if role in _KINDS and pid in pids and _ACTION not in name:
             made[pid, node][f"{_KINDS[role]}({name})"] += 1
     entry_of = dict[int, str]()  # by the callback's id
     columns = ("callback_id", "pid", "node", "kind", "topic", "declared_ns")
-    for number, pid, node, kind, name, period in flow.objects.callbacks.select(columns).iter_rows():
+    callbacks = flow.objects.callbacks.select(columns)
+    for number, pid, node, kind, name, period in callbacks.iter_rows():
         if kind == "timer" and period is not None:
             entry_of[number] = f"Timer({period})"
             if pid in pids:

@@ -145,7 +145,7 @@ class ThreadConfiguration(Part):
     @property
     def text(self) -> str:
         """For a person: ``SCHED_FIFO 87, cores 1, 2``."""
-        words = [self.policy]
+        words: list[str] = [self.policy]
         if self.policy == "SCHED_DEADLINE":
             words[0] += (
                 f" {format_duration(self.runtime or 0)} of {format_duration(self.period or 0)}"
