@@ -45,6 +45,8 @@ if TYPE_CHECKING:
     from chainshaper.enforcement.undoing import end_run as end_run
     from chainshaper.enforcement.undoing import find_runs as find_runs
     from chainshaper.flow.apply import apply_plan as apply_plan
+    from chainshaper.flow.callback_groups import export_callback_groups as export_callback_groups
+    from chainshaper.flow.callback_groups import with_callback_groups as with_callback_groups
     from chainshaper.flow.described import shape_application as shape_application
     from chainshaper.flow.doctor import examine_machine as examine_machine
     from chainshaper.flow.exploration import convert_recording as convert_recording

@@ -22,6 +22,7 @@ from chainshaper.enforcement.scheduling_memory import (
     look_alikes,
     note_descendants,
     release_threads,
+    remembered_threads,
 )
 from chainshaper.linux.scheduling import (
     SchedulingRequest,
@@ -31,7 +32,7 @@ from chainshaper.linux.scheduling import (
     set_state,
     state_of,
 )
-from chainshaper.linux.threads import RESET_ON_FORK, list_threads
+from chainshaper.linux.threads import RESET_ON_FORK, Reservation, find_thread, list_threads
 from chainshaper.values.errors import OperationError
 
 pytestmark = [
@@ -224,13 +225,20 @@ def _set_deadline(tid: int) -> bool:
     return bool(libc.syscall(314, tid, attributes, 0) == 0)  # sched_setattr
 
 
-def test_sched_deadline_is_refused_and_stays(tmp_path: Path, journal: Journal) -> None:
-    with acting(tmp_path, "a") as actor:
+def test_sched_deadline_is_left_and_stays(tmp_path: Path, journal: Journal) -> None:
+    with acting(tmp_path, "a", "b") as actor:
         if not _set_deadline(actor.tids["a"]):
             pytest.skip("SCHED_DEADLINE is not permitted here")
-        with pytest.raises(OperationError, match=r"\(a\).* runs under SCHED_DEADLINE.*chrt"):
-            change_all(journal, [(actor.thread("a"), WANTED)])
+        thread = find_thread(actor.tids["a"])
+        assert thread is not None
+        assert thread.reservation == Reservation(1_000_000, 100_000_000, 100_000_000)
+        assert thread.reservation.text == "1ms of 100ms"
+        change_all(journal, [(actor.thread("a"), WANTED), (actor.thread("b"), WANTED)])
         assert state_of(actor.tids["a"]).scheduling_class.policy == 6
+        assert [change.tid for change in remembered_threads(journal)] == [actor.tids["b"]]
+        other = find_thread(actor.tids["b"])
+        assert other is not None
+        assert other.reservation is None
         release_threads(journal)
         # Somebody may also give it to a thread that we have changed.
         os.sched_setscheduler(actor.tids["a"], os.SCHED_OTHER, os.sched_param(0))

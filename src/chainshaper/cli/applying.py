@@ -32,18 +32,25 @@ def threads(
         "executors for sure. Default: the plan's own, where it exists.",
     ),
     user: list[str] | None = opt.USERS,
+    callback_groups: Path | None = opt.option(
+        "--callback-groups FILE.yaml",
+        "A configuration of callback_isolated_executor: show what it gives to each thread, and"
+        " whether the thread has it.",
+    ),
     json: bool = opt.JSON,
 ) -> None:
     """Show the threads of running nodes: executors, DDS threads, publishers; class and cores."""
     from chainshaper.reporting.overviews import threads_json, threads_table
+    from chainshaper.values.callback_groups import read_group_configuration
 
+    given = None if callback_groups is None else read_group_configuration(callback_groups)
     pid = int(where) if where is not None and where.isdecimal() else None
     plan = None if where is None or pid is not None else cs.load_plan(where)
     with out.late_progress("threads") as report:
         report(0.0, "looking for nodes and their threads")
         known = opt.recording_of(recording)
         running = cs.find_threads(plan if pid is None else pid, known, users=user or ())
-    if out.present(json, threads_json(running), threads_table(running)):
+    if out.present(json, threads_json(running, given), threads_table(running, given)):
         out.notes(running.notes)
         if plan is not None:
             out.next_step("chainshaper", "apply", str(where), "--dry-run")

@@ -135,6 +135,11 @@ STRICT: bool = option("--strict", "Exit code 1 unless the plan's promise is met.
 PLAN_IN_FORCE: Path | None = option(
     "--plan plan.yaml", "The plan that the last recording was made with, where it does not say so."
 )
+CALLBACK_GROUPS: Path | None = option(
+    "--callback-groups FILE.yaml",
+    "The configuration of callback_isolated_executor that was in force: class and cores of each"
+    " callback group's thread. What the kernel showed while it ran counts before it.",
+)
 SCHEDULER: str | None = option(
     "--scheduler ADDRESS",
     "Compute on the Dask cluster whose scheduler is there, such as tcp://host:8786.",

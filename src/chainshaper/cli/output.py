@@ -198,6 +198,20 @@ def opened(
         yield cs.open_source(*trace, progress=report, through=through or ()), report
 
 
+def with_callback_groups(recording: "cs.Recording", path: Path | None) -> "cs.Recording":
+    """Return a recording with what a configuration of callback_isolated_executor gave its threads.
+
+    Prints notes about it.
+    """
+    from chainshaper.values.callback_groups import read_group_configuration
+
+    if path is None:
+        return recording
+    known, remarks = cs.with_callback_groups(recording, read_group_configuration(path))
+    notes(remarks)
+    return known
+
+
 def lost_events(recording: "cs.Recording") -> str:
     """Return a text about the events that were lost while recording, also if none was."""
     from chainshaper.values.recording import lost_text

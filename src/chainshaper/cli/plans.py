@@ -50,6 +50,7 @@ def plan(
     ),
     mode_profile: list[str] | None = opt.MODE_PROFILE,
     sink: list[str] | None = opt.SINK,
+    callback_groups: Path | None = opt.CALLBACK_GROUPS,
     convert: Path | None = opt.option(
         "--convert OLD.yaml",
         "Plan nothing: write the plan of an earlier version anew, to --output.",
@@ -79,7 +80,8 @@ def plan(
     if recording is None:
         profiles = _profile_of_latencies(latencies, period, [*wanted, *(sink or [])], since, until)
     else:
-        with out.opened("plan", [recording], through) as (source, report):
+        with out.opened("plan", [recording], through) as (read, report):
+            source = out.with_callback_groups(read, callback_groups)
             report(0.5, "measuring the chains")
             profiles = cs.profile_chains(
                 source,

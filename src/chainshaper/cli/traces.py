@@ -41,6 +41,7 @@ def describe(
     output: Path = opt.option("--output -o app.yaml", "File to write; must not exist.", ...),
     chain: str | None = opt.CHAIN,
     through: list[str] | None = opt.THROUGH,
+    callback_groups: Path | None = opt.CALLBACK_GROUPS,
 ) -> None:
     """Write the description of an application from a recording, with its execution times.
 
@@ -51,7 +52,8 @@ def describe(
 
     new_file(output, opt.DESCRIPTIONS)
     with out.opened("describe", trace, through) as (recording, _):
-        text, notes = application_file(recording, chain)
+        known = out.with_callback_groups(recording, callback_groups)
+        text, notes = application_file(known, chain)
         out.notes(notes)
     out.show_line(write_whole(output, [text.encode()]))
     out.next_step("chainshaper", "simulate", output, "-o", "simulated")
@@ -519,14 +521,33 @@ def export(
     chain: str | None = opt.CHAIN,
     through: list[str] | None = opt.THROUGH,
     plan: Path | None = opt.PLAN_IN_FORCE,
+    callback_groups: bool = opt.option(
+        "--callback-groups",
+        "The priorities and cores of --plan, by callback group: a configuration (.yaml) of"
+        " callback_isolated_executor, on which the recording was made.",
+        False,
+    ),
+    template: Path | None = opt.option(
+        "--template FILE.yaml",
+        "With --callback-groups: the file of `thread_configurator_node --prerun`, or yours. Its ids"
+        " are used, and what the plan does not concern stays.",
+    ),
 ) -> None:
     """Write a recording for another tool: threads, callbacks, messages, slots, stalls.
+
+    Or, with --callback-groups, the priorities of a plan for callback_isolated_executor.
 
     The chain's traversals are a track of their own where a chain is named or recorded, or the only
     one.
     """
-    if perfetto == mcap:
-        raise InputError("the format is missing: add --perfetto or --mcap")
+    if [perfetto, mcap, callback_groups].count(True) != 1:
+        reason = "the format is missing, or there are two"
+        raise InputError(f"{reason}: add one of --perfetto, --mcap and --callback-groups")
+    if template is not None and not callback_groups:
+        raise InputError("--template is for a plan's priorities: add --callback-groups")
+    if callback_groups:
+        _export_callback_groups(trace, output, plan, template, through)
+        return
     from chainshaper.reporting.perfetto import ENDINGS
     from chainshaper.values.files import new_file
     from chainshaper.verify.measure import SeveralChainsError
@@ -547,3 +568,26 @@ def export(
             written = cs.export_perfetto(measured or recording, output)
     out.show_line(written.absolute())
     out.notes((*recording.info.notes, out.lost_events(recording)))
+
+
+def _export_callback_groups(
+    trace: list[Path],
+    output: Path,
+    plan: Path | None,
+    template: Path | None,
+    through: list[str] | None,
+) -> None:
+    """Write the priorities and cores of a plan as a configuration of callback_isolated_executor."""
+    from chainshaper.values.callback_groups import read_group_configuration
+    from chainshaper.values.files import new_file, write_whole
+
+    new_file(output, opt.DESCRIPTIONS)
+    if plan is None:
+        raise InputError("the priorities are those of a plan: add --plan plan.yaml")
+    planned = cs.load_plan(plan)
+    theirs = None if template is None else read_group_configuration(template)
+    with out.opened("export", trace, through) as (recording, report):
+        report(0.5, "finding callback groups")
+        exported = cs.export_callback_groups(planned, recording, theirs)
+    out.show_line(write_whole(output, [exported.text.encode()]))
+    out.notes(exported.notes)

@@ -108,8 +108,9 @@ def note_scheduling(
 ) -> list[tuple[RunningThread, SchedulingState]]:
     """Write down how threads are scheduled before they are changed.
 
-    Returns the threads that have to be changed, each with what it is to have. Raises
-    OperationError: one runs under SCHED_DEADLINE, or the journal cannot be written.
+    Returns the threads that have to be changed, each with what it is to have. Threads under
+    SCHED_DEADLINE are left as they are: a class of ours would take their reservation away, and the
+    kernel refuses to bind them to a core. Raises OperationError: the journal cannot be written.
     """
     known = {change.identity: change for change in remembered_threads(journal)}
     families = _families(journal, list(known.values()))
@@ -123,10 +124,7 @@ def note_scheduling(
         if start_of(thread.pid, thread.tid) != thread.started:
             continue  # its id belongs to another thread by now
         if before.scheduling_class.policy == SCHED_DEADLINE:
-            raise OperationError(
-                f"{thread.text} runs under SCHED_DEADLINE, which is left alone: take it out of "
-                f"the plan, or give it another class first (`chrt --other --pid 0 {thread.tid}`)"
-            )
+            continue
         earlier = known.get(thread.identity)
         if earlier is None:
             # What it has inherited from a changed thread is not what it shall have afterwards.
@@ -205,6 +203,8 @@ def release_threads(journal: Journal, groups: Iterable[Path] = ()) -> None:
     def give_back(thread: RunningThread, family: list[Change]) -> bool:
         try:
             now = target = state_of(thread.tid)
+            if now.scheduling_class.policy == SCHED_DEADLINE:
+                return False  # another program gave it that since, and the kernel keeps its cores
             target = _given_back(now, family)
             set_state(thread.tid, target)
         except ProcessLookupError:

@@ -30,7 +30,8 @@ SCHED_FIFO priorities (DESIGN section 6). From the most urgent:
   fair class on the cores of DDS threads, since it spins on the same locks
   (`FlowControllerImpl::run`); and the threads of best-effort servers.
 
-All other threads are left alone.
+All other threads are left alone, and so are threads under SCHED_DEADLINE, wherever a plan has them:
+their reservation is what their own configuration gave them.
 """
 
 from collections import Counter
@@ -53,6 +54,7 @@ DDS_PRIORITY = 90
 _BEST_SERVER_PRIORITY = 87
 _BELOW = 1  # room for a publisher below a server's threads
 _LOOPS = "a loop that reads the output, in its place"
+_DEADLINE, _RESERVED = "SCHED_DEADLINE", "is under SCHED_DEADLINE, which is left as it is"
 _RECEIVES, _RECEIVES_IN_PLACE = "receives the output", "receives the output, in its place"
 
 
@@ -223,9 +225,34 @@ def scheduling_around(
     # The order in which a person reads them: servers' threads, DDS threads, the others.
     wanted.sort(key=lambda item: item.scheduling.priority is None)
     return tuple(
-        _below_siblings(item, wanted) if item.node_thread.thread.role == "publisher" else item
+        _left_to_deadline(
+            _below_siblings(item, wanted) if item.node_thread.thread.role == "publisher" else item
+        )
         for item in wanted
     )
+
+
+def _left_to_deadline(item: WantedScheduling) -> WantedScheduling:
+    """Change nothing of a thread under SCHED_DEADLINE, which its own configuration put there."""
+    if item.node_thread.thread.policy != _DEADLINE:
+        return item
+    return replace(item, scheduling=SchedulingRequest(None, None), reason=_RESERVED)
+
+
+def left_reservations(wanted: Iterable[WantedScheduling]) -> list[str]:
+    """Return a note on threads that stay under SCHED_DEADLINE, and what that means for the plan."""
+    threads = [item.node_thread for item in wanted if item.reason == _RESERVED]
+    if not threads:
+        return []
+    named = ", ".join(
+        f"{listed.thread.text} of {', '.join(listed.nodes)}"
+        + (f" ({listed.thread.reservation.text})" if listed.thread.reservation else "")
+        for listed in threads
+    )
+    return [
+        f"under SCHED_DEADLINE, and left so: {named}. Such threads come before all of SCHED_FIFO,"
+        " gates included, on any core, until their runtime is used up"
+    ]
 
 
 def _is_best_effort(server: Server | ReservationServer) -> bool:

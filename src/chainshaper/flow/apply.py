@@ -25,7 +25,7 @@ from chainshaper.enforcement.journal import Journal
 from chainshaper.enforcement.node_threads import IN_ORDER
 from chainshaper.enforcement.scheduling_memory import look_alikes
 from chainshaper.enforcement.servers import BackEnd
-from chainshaper.enforcement.thread_scheduling import waiting_receivers
+from chainshaper.enforcement.thread_scheduling import left_reservations, waiting_receivers
 from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow.followed_chains import followed_chains
 from chainshaper.flow.in_step import loops_in_step
@@ -273,7 +273,8 @@ def _schedule(
     refuse_simulated(plan, run_threads.latest)
     refuse_other_clocks(plan, run_threads.latest)
     notes = check_publishers(plan, run_threads.latest, recordings)
-    return notes + waiting_receivers(plan, run_threads.schedule(plan, back_end))
+    wanted = run_threads.schedule(plan, back_end)
+    return notes + waiting_receivers(plan, wanted) + left_reservations(wanted)
 
 
 def _begin_report(

@@ -10,6 +10,7 @@ from chainshaper.enforcement.planned_threads import server_members
 from chainshaper.enforcement.thread_scheduling import (
     WantedScheduling,
     left_by_back_end,
+    left_reservations,
     plan_scheduling,
     waiting_receivers,
 )
@@ -62,7 +63,11 @@ def planned_changes(
         refuse_other_clocks(plan, allocation)
         wanted = plan_scheduling(plan, allocation, available_cores())
         threads = left_by_back_end(choice.name, wanted, plan.free_threads)
-        notes = (*allocation.notes, *waiting_receivers(plan, threads))
+        notes = (
+            *allocation.notes,
+            *waiting_receivers(plan, threads),
+            *left_reservations(threads),
+        )
         return Changes(choice.name, choice.reason, threads, (), notes)
     notes, anchor_ns, members = allocation.notes, 0, dict[str, list[int | str]]()
     try:

@@ -6,8 +6,10 @@ of middlewares are in :mod:`chainshaper.values.middleware`.
 Upstream: proc(5).
 """
 
+import ctypes
 import functools
 import os
+import struct
 import time
 import zlib
 from collections.abc import Iterator
@@ -16,10 +18,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
+from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import text_of
 from chainshaper.values.middleware import ThreadWork, is_runtime_name, runtime_work, thread_work
 
 SCHED_DEADLINE = 6
+_SCHED_GETATTR = {"x86_64": 315, "aarch64": 275}  # the number of the system call
+_ATTRIBUTES = struct.Struct("=IIQiIQQQ")  # `struct sched_attr`, until the period
+_libc = ctypes.CDLL(None, use_errno=True)
 RESET_ON_FORK = getattr(os, "SCHED_RESET_ON_FORK", 0x40000000)
 """A flag that is in the same number as the policy."""
 TICK_NS = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
@@ -52,6 +58,23 @@ def role_of(comm: str, is_main: bool) -> ThreadRole:
 
 
 @dataclass(frozen=True)
+class Reservation:
+    """What SCHED_DEADLINE guarantees: ``runtime_ns`` within ``deadline_ns``, each period."""
+
+    runtime_ns: int
+    deadline_ns: int
+    period_ns: int
+
+    @property
+    def text(self) -> str:
+        """For a person: ``1ms of 100ms``, with the deadline where that is not the period."""
+        runtime, period = format_duration(self.runtime_ns), format_duration(self.period_ns)
+        if self.deadline_ns == self.period_ns:
+            return f"{runtime} of {period}"
+        return f"{runtime} within {format_duration(self.deadline_ns)} of {period}"
+
+
+@dataclass(frozen=True)
 class RunningThread:
     """A thread as the kernel shows it at one instant."""
 
@@ -65,6 +88,7 @@ class RunningThread:
     started: int = 0  # ticks (TICK_NS) after the machine booted
     inner_tid: int = 0  # its id in its own pid namespace, which tracers record in a container
     kind: ThreadWork | None = None  # what it does, of a DDS thread
+    reservation: Reservation | None = None  # of SCHED_DEADLINE; None: another class, or not shown
 
     @property
     def identity(self) -> tuple[int, int]:
@@ -133,7 +157,23 @@ def _thread(pid: int, tid: int, inner_pid: int | None) -> RunningThread | None:
         started=int(fields[_STARTED]),
         inner_tid=inner_tid,
         kind=None if tid == pid else thread_work(comm),
+        reservation=_reservation_of(tid) if policy == SCHED_DEADLINE else None,
     )
+
+
+def _reservation_of(tid: int) -> Reservation | None:
+    """Return what SCHED_DEADLINE guarantees a thread; None: it has ended, or has another class.
+
+    The C library has no function for `sched_getattr(2)` before glibc 2.41.
+    """
+    number = _SCHED_GETATTR.get(os.uname().machine)
+    attributes = ctypes.create_string_buffer(_ATTRIBUTES.size)
+    if number is None or _libc.syscall(number, tid, attributes, _ATTRIBUTES.size, 0) != 0:
+        return None
+    _, policy, _, _, _, runtime, deadline, period = _ATTRIBUTES.unpack(attributes.raw)
+    if policy != SCHED_DEADLINE:
+        return None
+    return Reservation(runtime, deadline, period or deadline)
 
 
 def all_stats() -> Iterator[tuple[int, list[bytes]]]:
@@ -286,7 +326,7 @@ def foreign_realtime_processes() -> tuple[str, ...]:
         if os.getpid() in (pid, parent) or not command or enforces:
             continue
         for thread in list_threads(pid):
-            if thread.policy in ("SCHED_FIFO", "SCHED_RR"):
+            if thread.policy in ("SCHED_FIFO", "SCHED_RR", "SCHED_DEADLINE"):
                 foreign.append(f"{thread.comm} ({pid})")
                 break
     return tuple(sorted(foreign))

@@ -23,6 +23,7 @@ from typing import Annotated, Literal, NamedTuple, TypeAlias
 from pydantic import AfterValidator, Field, model_validator
 
 from chainshaper.robot.gate import Anchor, IntoOpenSlot, Late, Messages, Overrun
+from chainshaper.values.callback_groups import parse_group_id
 from chainshaper.values.durations import (
     duration_text,
     format_duration,
@@ -196,6 +197,28 @@ class Thread(Part):
     role: Literal["executor", "publisher"] = "executor"
     # The callbacks of the executor, by topic or as `every 100ms`; none: all executors of the node.
     callbacks: tuple[Annotated[str, AfterValidator(_callback)], ...] = ()
+    # The executor's callback group as callback_isolated_executor names it, which says node and
+    # callbacks as well (values/callback_groups.py).
+    callback_group: str | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_its_group(cls, values: object) -> object:
+        """Take node and callbacks from the callback group, where only that is written."""
+        if not isinstance(values, dict) or not isinstance(values.get("callback_group"), str):
+            return values
+        try:
+            group = parse_group_id(values["callback_group"])
+        except ValueError as error:
+            raise wrong_value(str(error), "callback_group") from error
+        if not group.triggers:
+            reason = "has neither timer nor subscription of its own: a plan's thread runs some"
+            raise wrong_value(f"{group.id} {reason}", "callback_group")
+        for key, value in (("node", group.node), ("callbacks", group.triggers)):
+            if tuple(values.get(key) or value) != tuple(value):
+                reason = f"is not that of {group.id}: write the one or the other"
+                raise wrong_value(reason, key)
+        return {**values, "node": group.node, "callbacks": group.triggers}
 
     def overlaps(self, thread: "Thread") -> bool:
         """Whether a running thread may be both."""
@@ -208,6 +231,8 @@ class Thread(Part):
     @property
     def text(self) -> str:
         """The thread as messages name it."""
+        if self.callback_group is not None:
+            return f"the thread of callback group {self.callback_group}"
         runs = f" that runs {', '.join(self.callbacks)}" if self.callbacks else ""
         return f"the {self.role} of {self.node}{runs}"
 

@@ -109,7 +109,14 @@ def _yaml_values(chain_plan: ChainPlan) -> dict[str, Any]:
     )
     for server in values["servers"]:
         server["threads"] = [
-            _OnOneLine({key: value for key, value in thread.items() if value})
+            _OnOneLine(
+                {
+                    key: value
+                    for key, value in thread.items()
+                    # A callback group's id says these two as well.
+                    if value and not ("callback_group" in thread and key in ("node", "callbacks"))
+                }
+            )
             for thread in server["threads"]
         ]
         if not server["best_effort"]:

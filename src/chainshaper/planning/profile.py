@@ -147,6 +147,8 @@ class Profile:
     core_of: Mapping[str, int] = field(default_factory=dict)
     # Node with several executors → those that take part, each by the names of its callbacks.
     executors: Mapping[str, tuple[tuple[str, ...], ...]] = field(default_factory=dict)
+    # Those of them that run one callback group → its id, as callback_isolated_executor names it.
+    callback_groups: Mapping[tuple[str, tuple[str, ...]], str] = field(default_factory=dict)
     cores: Mapping[str, int] = field(default_factory=dict)  # any node with one core → that core
     every_node: tuple[str, ...] = ()  # all nodes of the recording
     together: tuple[tuple[str, ...], ...] = ()  # nodes that share a process

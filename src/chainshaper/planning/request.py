@@ -148,7 +148,15 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
     if request.fallback != _STANDARD.fallback and no_process:
         reason = f"--fallback {request.fallback} is for a shaping node that is a process"
         raise InputError(f"{reason}: leave it out, or plan with --publication synchronous")
-    plan = shaping.with_executors(plan, [output.executors for output in (profile, *sinks)])
+    plan = shaping.with_executors(
+        plan,
+        [output.executors for output in (profile, *sinks)],
+        {
+            executor: group_id
+            for output in (profile, *sinks)
+            for executor, group_id in output.callback_groups.items()
+        },
+    )
     plan = plans.revised(plan, modes=modes, slot_ends=request.slot_ends)
     plan = shaping.with_turns(plan, request.equal_priorities)
     plan = loops.with_loop(plan, profile, request)

@@ -9,6 +9,7 @@ that covers more of a graph (5.1 and 5.4), or follows another policy (2.5, 5.1 a
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import product, zip_longest
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -334,12 +335,15 @@ def _chain_and_others(plan: ChainPlan) -> tuple[Server, list[Server]]:
 
 
 def with_executors(
-    plan: ChainPlan, executors: Sequence[Mapping[str, Sequence[tuple[str, ...]]]]
+    plan: ChainPlan,
+    executors: Sequence[Mapping[str, Sequence[tuple[str, ...]]]],
+    groups: Mapping[tuple[str, tuple[str, ...]], str] = MappingProxyType({}),
 ) -> ChainPlan:
     """Return the plan with single executors of nodes that have several (section 6).
 
     ``executors`` has, for each output, the executors that take part of each such node, by the names
-    of their callbacks. The node's other executors are in no server.
+    of their callbacks. The node's other executors are in no server. ``groups`` has the ids of those
+    that run one callback group each.
     """
     servers = []
     for server in plan.servers:
@@ -350,7 +354,12 @@ def with_executors(
             )
             if not callbacks or thread.role != "executor":
                 callbacks = {(): None}  # all executors of the node
-            threads += [thread.model_copy(update={"callbacks": names}) for names in callbacks]
+            threads += [
+                thread.model_copy(
+                    update={"callbacks": names, "callback_group": groups.get((thread.node, names))}
+                )
+                for names in callbacks
+            ]
         servers.append(server.model_copy(update={"threads": tuple(threads)}))
     return plans.revised(plan, servers=tuple(servers))
 

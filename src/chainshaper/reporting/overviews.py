@@ -13,11 +13,12 @@ import polars as pl
 
 from chainshaper.analysis import ChainEnumeration
 from chainshaper.analysis.contradictions import Contradiction
+from chainshaper.enforcement.configured_threads import configured, difference
 from chainshaper.enforcement.journal import Journal
 from chainshaper.enforcement.node_threads import Allocation, NodeThread
 from chainshaper.enforcement.thread_scheduling import WantedScheduling
 from chainshaper.enforcement.undoing import LoopState, RunState, ServerState
-from chainshaper.linux.threads import POLICIES
+from chainshaper.linux.threads import POLICIES, RunningThread
 from chainshaper.planning import BandChoice, ChainPlan, band_predictions, publish_slots
 from chainshaper.planning.chain_plan import slot_text
 from chainshaper.reporting.graph_drawing import short_symbol
@@ -41,6 +42,11 @@ from chainshaper.reporting.tables import (
     words,
 )
 from chainshaper.values.application import ApplicationGraph, Chain, trigger_text
+from chainshaper.values.callback_groups import (
+    CallbackGroup,
+    GroupConfiguration,
+    ThreadConfiguration,
+)
 from chainshaper.values.durations import duration_text, format_duration, milliseconds
 from chainshaper.values.hosts import process_text
 from chainshaper.values.recording import (
@@ -248,8 +254,14 @@ def chain_table(graph: ApplicationGraph, enumeration: ChainEnumeration) -> Resul
     return table
 
 
-def threads_json(allocation: Allocation) -> dict[str, Any]:
-    """The threads of a running application as plain data, and notes on what is not certain."""
+def threads_json(
+    allocation: Allocation, configuration: GroupConfiguration | None = None
+) -> dict[str, Any]:
+    """The threads of a running application as plain data, and notes on what is not certain.
+
+    With a configuration of callback_isolated_executor, what it gives to each of them, too.
+    """
+    given = {} if configuration is None else configured(allocation.threads, configuration)
     rows = [
         {
             "nodes": list(listed_thread.nodes),
@@ -265,16 +277,48 @@ def threads_json(allocation: Allocation) -> dict[str, Any]:
             "policy": listed_thread.thread.policy,
             "priority": listed_thread.thread.priority,
             "cores": list(listed_thread.thread.cores),
+            "reservation": listed_thread.thread.reservation
+            and vars(listed_thread.thread.reservation),
+            **(
+                {}
+                if configuration is None
+                else _configured_json(listed_thread, given.get(listed_thread.thread.identity))
+            ),
         }
         for listed_thread in allocation.threads
     ]
     return {"threads": rows, "notes": list(allocation.notes)}
 
 
-def threads_table(allocation: Allocation) -> ResultTable:
-    """Make a table of threads; node and process are left out where the row above has the same."""
-    columns = words("node", "pid", "tid", "name", "role", "class", "cores", "known by")
-    table = ResultTable("Threads", columns)
+def _configured_json(
+    listed_thread: NodeThread, pair: tuple[CallbackGroup, ThreadConfiguration] | None
+) -> dict[str, Any]:
+    """What a configuration gives to a thread: its group, the scheduling, and how the two differ."""
+    if pair is None:
+        return {"callback_group": None, "configured": None, "differs": None}
+    group, entry = pair
+    return {
+        "callback_group": group.id,
+        "configured": {
+            "policy": entry.policy,
+            "priority": entry.real_time_priority,
+            "cores": [*(entry.affinity or ())],
+        },
+        "differs": difference(entry, listed_thread.thread),
+    }
+
+
+def threads_table(
+    allocation: Allocation, configuration: GroupConfiguration | None = None
+) -> ResultTable:
+    """Make a table of threads; node and process are left out where the row above has the same.
+
+    With a configuration of callback_isolated_executor it has a further column.
+    """
+    names = ["node", "pid", "tid", "name", "role", "class", "cores", "known by"]
+    given = {} if configuration is None else configured(allocation.threads, configuration)
+    names += [] if configuration is None else ["configured"]
+    table = ResultTable("Threads", words(*names))
     row_above: NodeThread | None = None
     for listed_thread in allocation.threads:
         thread = listed_thread.thread
@@ -288,11 +332,27 @@ def threads_table(allocation: Allocation) -> ResultTable:
             known_by.append(f"node: {listed_thread.nodes_known_by or None}")
         role = f"DDS {thread.kind}" if thread.role == "dds" else ", ".join((thread.role, *names))
         scheduling = scheduling_text(thread.policy, thread.priority), core_ranges(thread.cores)
+        if thread.reservation is not None:
+            scheduling = f"{scheduling[0]} {thread.reservation.text}", scheduling[1]
         nodes = "" if same_nodes else ", ".join(listed_thread.nodes) or UNKNOWN
         numbers = thread.pid if first else "", thread.tid, thread.comm
-        table.add(nodes, *numbers, role, *scheduling, "; ".join(known_by))
+        cells = [nodes, *numbers, role, *scheduling, "; ".join(known_by)]
+        if configuration is not None:
+            cells.append(_configured_text(thread, given.get(thread.identity)))
+        table.add(*cells)
         row_above = listed_thread
     return table
+
+
+def _configured_text(
+    thread: RunningThread, pair: tuple[CallbackGroup, ThreadConfiguration] | None
+) -> str:
+    """What a configuration gives to a thread, and whether the thread has it."""
+    if pair is None:
+        return ""
+    group, entry = pair
+    state = "as it has" if difference(entry, thread) is None else "in place of what it has"
+    return f"{group.id}: {entry.text}, {state}"
 
 
 def core_ranges(cores: Sequence[int]) -> str:

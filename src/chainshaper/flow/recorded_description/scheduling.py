@@ -13,6 +13,7 @@ from chainshaper.flow.recorded_description.evidence import Evidence
 from chainshaper.flow.recorded_description.nodes import DescribedNode
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.values import events
+from chainshaper.values.recording import ThreadInfo
 
 _DEFAULT_PRIORITY, _DDS_PRIORITY, _MOST_URGENT = 80, 90, 97
 _REAL_TIME = ("SCHED_FIFO", "SCHED_RR")
@@ -101,8 +102,7 @@ def _priorities(evidence: Evidence, threads: Mapping[str, Sequence[ThreadKey]]) 
     ``threads`` are those of each node.
     """
     known = {
-        (thread.pid, thread.tid): thread.priority if thread.policy in _REAL_TIME else 0
-        for thread in evidence.recording.info.threads
+        (thread.pid, thread.tid): _priority_of(thread) for thread in evidence.recording.info.threads
     }
     if not known:
         switches = events.table(evidence.flow.events, "sched_switch").drop_nulls("next_prio")
@@ -135,6 +135,16 @@ def _priorities(evidence: Evidence, threads: Mapping[str, Sequence[ThreadKey]]) 
             f"{', '.join(ordinary)} had no SCHED_FIFO priority: described with the lowest."
         )
     return priorities
+
+
+def _priority_of(thread: ThreadInfo) -> int:
+    """Return a thread's priority in the description, which has SCHED_FIFO alone; 0: none.
+
+    Threads under SCHED_DEADLINE come before all of SCHED_FIFO.
+    """
+    if thread.policy == "SCHED_DEADLINE":
+        return _MOST_URGENT
+    return thread.priority if thread.policy in _REAL_TIME else 0
 
 
 def _dds_scheduling(evidence: Evidence) -> dict[str, int]:

@@ -83,6 +83,7 @@ def profile_of(
         upstream=upstream_topics(graph, chain, stages),
         core_of=core_of,
         executors=executors.named,
+        callback_groups=executors.groups,
         cores=executors.cores,
         every_node=tuple(node.name for node in graph.nodes),
         together=nodes_sharing_processes(graph, nodes),

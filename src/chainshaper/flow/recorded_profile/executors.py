@@ -8,6 +8,7 @@ from itertools import chain as joined
 import polars as pl
 
 from chainshaper.analysis import DataFlow, LatencyAnalysis, executors
+from chainshaper.analysis.callback_groups import recorded_groups
 from chainshaper.analysis.disturbance import overlapping
 from chainshaper.analysis.latency import RecordedExecutor
 from chainshaper.flow.recorded_profile.stages import Stage
@@ -24,6 +25,8 @@ class ChainExecutors:
     # Node with several executors → those that take part, each by the names of its callbacks. Only
     # nodes whose callbacks have names of their own are in it.
     named: Mapping[str, tuple[tuple[str, ...], ...]]
+    # Those of them that run one callback group → its id, as callback_isolated_executor names it.
+    groups: Mapping[tuple[str, tuple[str, ...]], str]
     cores: Mapping[str, int]  # any node whose executor is bound to one core → that core
     priorities: Mapping[str, int]  # any node whose executor has a SCHED_FIFO priority → that
 
@@ -57,6 +60,11 @@ def executors_of_chain(
     return ChainExecutors(
         running=running,
         named=named,
+        groups={
+            (known.group.node, known.names): known.group.id
+            for known in recorded_groups(flow)
+            if known.certain and known.names in named.get(known.group.node, ())
+        },
         cores={
             node: thread.cores[0] for node, thread in thread_of.items() if len(thread.cores) == 1
         },
