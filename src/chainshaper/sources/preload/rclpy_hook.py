@@ -1,0 +1,258 @@
+"""Have callbacks of rclpy say when they begin and end, as those of rclcpp do by themselves.
+
+This file is run, not imported: by the interpreter of a node, from the text that the library in front
+of ROS 2 carries (`in_python.h`), while `rclpy.init` calls `rcl_init`. So it is Python 3.8, imports
+nothing of ours, and finds as globals what the library gives:
+
+* ``traced(callback)``: a function that calls the callback and emits `callback_start` and
+  `callback_end`; and its handle.
+* ``registered(kind, entity, callback, owner, symbol)``: emits the events of a registration.
+* ``step(callback, call, state)``: emits `coroutine_step`.
+
+What rclpy runs is the attribute `callback` of a timer, subscription, service or guard condition,
+whichever executor runs it: this attribute becomes one that gives a traced callback. What is set stays
+what it was; whatever is not as expected leaves the callback as it is. ``problem`` says of what
+nothing is traced (empty: all is), None that there is no rclpy yet.
+"""
+
+import functools
+import inspect
+import itertools
+import sys
+import types
+
+TIMER, SUBSCRIPTION, SERVICE, OF_NODE, TIMER_OF_NODE = range(5)
+BEGINS, RUNS, WAITS, DONE, CREATED = range(5)
+TRACED, HANDLE, EMITS = "_chainshaper_traced", "_chainshaper_handle", "chainshaper_emits_events"
+ENTITIES = (
+    ("rclpy.timer", "Timer", TIMER),
+    ("rclpy.subscription", "Subscription", SUBSCRIPTION),
+    ("rclpy.service", "Service", SERVICE),
+    ("rclpy.guard_condition", "GuardCondition", None),  # whose node is known when it is created
+)
+calls = itertools.count(1)
+
+
+@types.coroutine
+def steps(coroutine, handle, call):
+    """Run a coroutine as `await` does; emit when it runs, when it waits, and when it is done."""
+    value = error = None
+    step(handle, call, BEGINS)
+    while True:
+        try:
+            awaited = coroutine.send(value) if error is None else coroutine.throw(error)
+        except StopIteration as stop:
+            step(handle, call, DONE)
+            return stop.value
+        except BaseException:
+            step(handle, call, DONE)
+            raise
+        step(handle, call, WAITS)
+        value = error = None
+        try:
+            value = yield awaited
+            step(handle, call, RUNS)
+        except GeneratorExit:  # it is cancelled
+            step(handle, call, RUNS)
+            try:
+                coroutine.close()
+            finally:
+                step(handle, call, DONE)
+            raise
+        except BaseException as thrown:
+            step(handle, call, RUNS)
+            error = thrown
+
+
+def traced_callback(callback):
+    """Return a callback that emits its events, and can do all that this one can; with its handle."""
+    if inspect.iscoroutinefunction(callback):
+
+        async def run(*arguments, **named):
+            coroutine = callback(*arguments, **named)
+            if not inspect.iscoroutine(coroutine):
+                return await coroutine
+            return await steps(coroutine, handle, next(calls))
+
+        handle = id(run)
+    else:
+        function, handle = traced(callback)
+        run = functools.partial(function)  # which can have attributes
+    functools.update_wrapper(run, callback)  # its signature is looked at
+    run.__dict__[HANDLE] = handle
+    return run
+
+
+def untraced(callback):
+    """Return what was traced: the callback of one entity may be given to another one."""
+    return callback.__wrapped__ if HANDLE in getattr(callback, "__dict__", ()) else callback
+
+
+def symbol_of(callback):
+    """Return a callback's name."""
+    while isinstance(callback, functools.partial):
+        callback = callback.func
+    name = getattr(callback, "__qualname__", None) or type(callback).__qualname__
+    module = getattr(callback, "__module__", None)
+    return (module + "." if isinstance(module, str) else "") + name
+
+
+def register(kind, entity, run):
+    """Emit which entity a traced callback belongs to; return whether it could be done."""
+    if kind is None:
+        return True
+    try:
+        pointer = entity.handle.pointer
+    except Exception:  # it is not there yet: the callback is registered before it runs first
+        return False
+    registered(kind, pointer, run.__dict__[HANDLE], id(entity), symbol_of(run.__wrapped__))
+    return True
+
+
+def follow_callbacks(entity_class, kind):
+    """Have the attribute `callback` of a class give traced callbacks."""
+    before = getattr(entity_class, "callback", None)  # a property, or there is none
+
+    def raw(entity):
+        if before is not None:
+            return before.__get__(entity, type(entity))
+        try:
+            return entity.__dict__["callback"]
+        except KeyError:
+            raise AttributeError("callback") from None
+
+    def read(entity):
+        callback = raw(entity)
+        entry = entity.__dict__.get(TRACED)
+        if entry is None or entry[0] is not callback:
+            return callback
+        if not entry[2]:
+            entry[2] = register(kind, entity, entry[1])
+        return entry[1]
+
+    def write(entity, callback):
+        callback = untraced(callback)
+        if before is not None:
+            before.__set__(entity, callback)
+        else:
+            entity.__dict__["callback"] = callback
+        try:
+            entity.__dict__.pop(TRACED, None)
+            if not callable(callback) or getattr(callback, EMITS, False):
+                return
+            run = traced_callback(callback)
+            entity.__dict__[TRACED] = [raw(entity), run, register(kind, entity, run)]
+        except Exception:  # it is not traced
+            pass
+
+    if before is not None and not hasattr(before, "__set__"):
+        raise TypeError("`callback` of {} is no attribute".format(entity_class.__name__))
+    entity_class.callback = property(read, write)
+
+
+def follow_owners(node_class):
+    """Have a node say which timers and guard conditions are its own when it creates them."""
+
+    def linking(name, link):
+        create = getattr(node_class, name)
+
+        @functools.wraps(create)
+        def created(self, *arguments, **named):
+            entity = create(self, *arguments, **named)
+            try:
+                link(entity, self.handle.pointer)
+            except Exception:  # its node is not known
+                pass
+            return entity
+
+        return name, created
+
+    def link_timer(timer, node):
+        registered(TIMER_OF_NODE, timer.handle.pointer, 0, node, "")
+
+    def link_condition(condition, node):
+        run = condition.__dict__[TRACED][1]
+        registered(OF_NODE, 0, run.__dict__[HANDLE], node, symbol_of(run.__wrapped__))
+
+    created = [
+        linking("create_timer", link_timer),
+        linking("create_guard_condition", link_condition),
+    ]
+    return [(node_class, *one) for one in created]
+
+
+def traced_task(callback, call):
+    """Return what runs a task, a function, a coroutine function or a coroutine, with its events."""
+    if inspect.iscoroutinefunction(callback):
+
+        async def run(*arguments, **named):
+            return await steps(callback(*arguments, **named), 0, call)
+
+    elif inspect.iscoroutine(callback):
+
+        async def run():
+            return await steps(callback, 0, call)
+
+        return run()
+    elif callable(callback):
+
+        def run(*arguments, **named):
+            step(0, call, BEGINS)
+            try:
+                return callback(*arguments, **named)
+            finally:
+                step(0, call, DONE)
+
+    else:
+        return callback
+    return functools.update_wrapper(run, callback)
+
+
+def following_tasks(executor_class):
+    """Have tasks say when they run, and in which callback they were created."""
+    create = executor_class.create_task
+
+    @functools.wraps(create)
+    def create_task(self, callback, *arguments, **named):
+        try:
+            call = next(calls)
+            task = traced_task(callback, call)
+            step(0, call, CREATED)
+        except Exception:
+            task = callback
+        return create(self, task, *arguments, **named)
+
+    return executor_class, "create_task", create_task
+
+
+def follow():
+    """Follow all that there is of rclpy; return what is not followed."""
+    __import__("rclpy.node")
+    __import__("rclpy.executors")
+    problems, changes = [], []
+    for module, name, kind in ENTITIES:
+        try:
+            follow_callbacks(getattr(sys.modules[module], name), kind)
+        except Exception as error:
+            problems.append("{}: {!r}".format(name, error))
+    classes = [sys.modules["rclpy.executors"].Executor]
+    native = sys.modules.get("rclpy._rclpy_pybind11")
+    if hasattr(native, "EventsExecutor"):
+        classes.append(native.EventsExecutor)
+    try:
+        changes += follow_owners(sys.modules["rclpy.node"].Node)
+        changes += map(following_tasks, classes)
+        for changed in changes:
+            setattr(*changed)
+    except Exception as error:
+        problems.append(repr(error))
+    return "; ".join(problems)
+
+
+rclpy = sys.modules.get("rclpy")
+problem = None
+if rclpy is not None:
+    try:
+        problem = follow()
+    except Exception as error:
+        problem = repr(error)
