@@ -1,9 +1,9 @@
 """Nodes of rclpy that note themselves when their callbacks run:
-NOTES single|multi|events SECONDS [OPTION …]
+NOTES single|multi|events SECONDS [raising]
 
-A line of NOTES is the note of an instance, in JSON: `callback`, `node`, `tid`, and `runs`, when it
-ran: pairs of ns of CLOCK_MONOTONIC (of a coroutine several). Options: `actions`; `raising`, whose
-timer raises an exception in each third call.
+A line of NOTES is the note of an instance, in JSON: `callback`, `node`, `tids`, and `runs`, when it
+ran: pairs of ns of CLOCK_MONOTONIC (of a coroutine several). `raising`: a timer raises an exception
+in each third call.
 """
 
 import functools
@@ -14,13 +14,13 @@ import threading
 import time
 
 import rclpy
+from rcl_interfaces.srv import ListParameters
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
 from sensor_msgs.msg import Imu, Temperature
-from std_srvs.srv import Trigger
 
 notes = []
 
@@ -90,16 +90,17 @@ class Sensor(Node):
 
 
 class Worker(Node):
-    def __init__(self):
+    def __init__(self, kind):
         super().__init__("worker")
         group = ReentrantCallbackGroup()
         self.outputs = {
             topic: self.create_publisher(Imu, topic, 10)
             for topic in ("/done", "/asked", "/later", "/condition", "/by_task", "/answered")
         }
-        self.client = self.create_client(Trigger, "/judge", callback_group=group)
-        self.create_service(Trigger, "/judge", self.judge, callback_group=group)
-        self.condition = self.create_guard_condition(self.triggered)
+        self.client = self.create_client(ListParameters, "/judge", callback_group=group)
+        self.create_service(ListParameters, "/judge", self.judge, callback_group=group)
+        # The events executor refuses guard conditions.
+        self.condition = self.create_guard_condition(self.triggered) if kind != "events" else None
         qos = QoSProfile(depth=10)
         self.create_subscription(Imu, "/raw", self.work, qos)
         self.create_subscription(Imu, "/raw", self.ask, qos, callback_group=group)
@@ -112,7 +113,8 @@ class Worker(Node):
     def work(self, message):
         busy(0.003)
         self.outputs["/done"].publish(message)
-        self.condition.trigger()
+        if self.condition:
+            self.condition.trigger()
 
     @noted
     def triggered(self):
@@ -122,14 +124,14 @@ class Worker(Node):
     @noted
     def judge(self, request, response):
         busy(0.001)
-        response.success = True
+        response.result.names = request.prefixes
         return response
 
     async def ask(self, message):
         """A coroutine that waits for a service of its own executor."""
         note = Note("ask", self)
         busy(0.001)
-        request = self.client.call_async(Trigger.Request())
+        request = self.client.call_async(ListParameters.Request())
         note.wait()
         await request
         note.run()
@@ -160,7 +162,7 @@ class Worker(Node):
     def hand_over(self, message):
         """Leaves its output to a task, and asks a service whose answer another task handles."""
         self.executor.create_task(self.task)
-        self.client.call_async(Trigger.Request()).add_done_callback(self.answered)
+        self.client.call_async(ListParameters.Request()).add_done_callback(self.answered)
 
     def task(self):
         busy(0.0005)
@@ -193,7 +195,7 @@ def main():
     file, kind, seconds, *options = rclpy.utilities.remove_ros_args(sys.argv)[1:]
     rclpy.init()
     sensor = Sensor("raising" in options)
-    nodes = [sensor, Worker(), Sink()]
+    nodes = [sensor, Worker(kind), Sink()]
     executor = executor_of(kind)
     for node in nodes:
         executor.add_node(node)

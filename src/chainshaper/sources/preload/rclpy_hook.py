@@ -23,7 +23,8 @@ import types
 
 TIMER, SUBSCRIPTION, SERVICE, OF_NODE, TIMER_OF_NODE = range(5)
 BEGINS, RUNS, WAITS, DONE, CREATED = range(5)
-TRACED, HANDLE, EMITS = "_chainshaper_traced", "_chainshaper_handle", "chainshaper_emits_events"
+TRACED, HANDLE, NODE = "_chainshaper_traced", "_chainshaper_handle", "_chainshaper_node"
+EMITS = "chainshaper_emits_events"
 ENTITIES = (
     ("rclpy.timer", "Timer", TIMER),
     ("rclpy.subscription", "Subscription", SUBSCRIPTION),
@@ -106,6 +107,8 @@ def register(kind, entity, run):
     except Exception:  # it is not there yet: the callback is registered before it runs first
         return False
     registered(kind, pointer, run.__dict__[HANDLE], id(entity), symbol_of(run.__wrapped__))
+    if NODE in entity.__dict__:  # rclcpp says it after the callback as well
+        registered(TIMER_OF_NODE, pointer, 0, entity.__dict__[NODE], "")
     return True
 
 
@@ -168,7 +171,11 @@ def follow_owners(node_class):
         return name, created
 
     def link_timer(timer, node):
-        registered(TIMER_OF_NODE, timer.handle.pointer, 0, node, "")
+        entry = timer.__dict__.get(TRACED)
+        timer.__dict__[NODE] = node
+        if entry is not None and entry[2]:
+            registered(TIMER_OF_NODE, timer.handle.pointer, 0, node, "")
+        timer.callback  # which registers it, if it is not
 
     def link_condition(condition, node):
         run = condition.__dict__[TRACED][1]
