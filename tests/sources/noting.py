@@ -12,6 +12,7 @@ import os
 import sys
 import threading
 import time
+from pathlib import Path
 
 import rclpy
 from rcl_interfaces.srv import ListParameters
@@ -139,7 +140,7 @@ class Worker(Node):
         self.outputs["/asked"].publish(message)
         note.done()
 
-    async def sleep(self, message):
+    async def sleep(self, _):
         """A coroutine that waits for a time, and whose instances overlap those of `ask`."""
         note = Note("sleep", self)
         for _ in range(2):
@@ -159,7 +160,7 @@ class Worker(Node):
             entry[1].set_result(None)
 
     @noted
-    def hand_over(self, message):
+    def hand_over(self, _):
         """Leaves its output to a task, and asks a service whose answer another task handles."""
         self.executor.create_task(self.task)
         self.client.call_async(ListParameters.Request()).add_done_callback(self.answered)
@@ -168,7 +169,7 @@ class Worker(Node):
         busy(0.0005)
         self.outputs["/by_task"].publish(Imu())
 
-    def answered(self, future):
+    def answered(self, _):
         self.outputs["/answered"].publish(Imu())
 
 
@@ -178,7 +179,7 @@ class Sink(Node):
         for topic in ("/done", "/asked", "/later"):
             self.create_subscription(Imu, topic, functools.partial(self.take, topic), 10)
 
-    def take(self, topic, message):
+    def take(self, topic, _):
         note = Note("take" + topic, self)
         note.done()
 
@@ -208,7 +209,7 @@ def main():
             raised += 1
         except (KeyboardInterrupt, ExternalShutdownException):
             break
-    with open(file, "w") as output:
+    with Path(file).open("w") as output:
         for note in notes:
             output.write(json.dumps(note) + "\n")
     assert bool(raised) == bool(sensor.raises)

@@ -4,8 +4,8 @@ Its classes hold callbacks as those of Humble to Rolling do. What calls `rcl_ini
 library's function for that event, with the interpreter's lock held.
 """
 
-import shutil
 import subprocess
+import sys
 import textwrap
 from pathlib import Path
 
@@ -144,17 +144,23 @@ else:
     raise AssertionError("what rclpy refuses is refused")
 """
 
-VERSIONS = [f"3.{minor}" for minor in range(8, 15)]
+
+def interpreters() -> dict[str, str]:
+    """The Pythons of this machine, from 3.8 on, by version."""
+    found = {"own": sys.executable}
+    for version in (f"3.{minor}" for minor in range(8, 15)):
+        places = [*Path.home().glob(f".pyenv/versions/{version}.*/bin/python")]
+        places += [Path(f"/usr/bin/python{version}")]
+        found |= dict.fromkeys([version], str(next(filter(Path.exists, places), "")))
+    return {version: place for version, place in found.items() if place}
 
 
-@pytest.fixture(params=VERSIONS)
+INTERPRETERS = interpreters()
+
+
+@pytest.fixture(params=INTERPRETERS)
 def interpreter(request: pytest.FixtureRequest) -> str:
-    name = f"python{request.param}"
-    places = [*Path.home().glob(f".pyenv/versions/{request.param}.*/bin/python")]
-    found = str(places[0]) if places else shutil.which(name)
-    if found is None or subprocess.run([found, "-c", ""], check=False).returncode:
-        pytest.skip(f"no {name} here")
-    return found
+    return INTERPRETERS[request.param]
 
 
 def run(interpreter: str, folder: Path, changed: str = "", **variables: str) -> EventTables:
@@ -223,8 +229,7 @@ def test_callbacks_emit_what_those_of_rclcpp_emit(interpreter: str, tmp_path: Pa
 )
 def test_an_unexpected_rclpy_goes_on_and_is_said(tmp_path: Path, changed: str, says: str) -> None:
     program = f"{changed}\nlibrary.ros_trace_rcl_init(1, None, None, None, None); sys.exit()"
-    interpreter = shutil.which("python3") or ""
-    tables = run(interpreter, tmp_path, program)
+    tables = run(sys.executable, tmp_path, program)
     (problem,) = tables["rclpy_followed"]["problem"]
     assert says in problem
     (note,) = [note for note in data_flow(tables).objects.notes if "inferred, not followed" in note]
@@ -234,5 +239,5 @@ def test_an_unexpected_rclpy_goes_on_and_is_said(tmp_path: Path, changed: str, s
 def test_inference_can_be_wished_for(tmp_path: Path) -> None:
     program = "library.ros_trace_rcl_init(1, None, None, None, None)\n"
     program += "import rclpy.node; assert 'callback' not in vars(rclpy.timer.Timer); sys.exit()"
-    tables = run(shutil.which("python3") or "", tmp_path, program, CHAINSHAPER_RCLPY="inferred")
+    tables = run(sys.executable, tmp_path, program, CHAINSHAPER_RCLPY="inferred")
     assert "rclpy_followed" not in tables

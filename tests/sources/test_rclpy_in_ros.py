@@ -38,9 +38,12 @@ def ran(tmp_path: Path) -> Ran:
     ) -> tuple[DataFlow, list[dict[str, Any]]]:
         environment = {**ros2_environment(), "ROS_DOMAIN_ID": str(100 + os.getpid() % 100)}
         asked = "import rclpy.experimental"
-        if kind == "events" and subprocess.run(
-            ["env", "python3", "-c", asked], env=environment, capture_output=True, check=False
-        ).returncode:
+        if (
+            kind == "events"
+            and subprocess.run(
+                ["env", "python3", "-c", asked], env=environment, capture_output=True, check=False
+            ).returncode
+        ):
             pytest.skip("this rclpy has no events executor")
         words = [str(NODES), str(tmp_path / "notes"), kind, "4", *options]
         if "-I" in python:
@@ -122,7 +125,9 @@ def check_outputs(flow: DataFlow) -> None:
     about = flow.objects.callbacks.unique("callback_id", keep="first")
     wrote = flow.publications.join(
         about.select("callback_id", "symbol", "kind"), on="callback_id", how="left"
-    ).with_columns(pl.col("topic").cast(pl.String), name=pl.col("symbol").str.split(".").list.last())
+    ).with_columns(
+        pl.col("topic").cast(pl.String), name=pl.col("symbol").str.split(".").list.last()
+    )
     by = wrote.group_by("topic").agg(pl.col("name", "kind").unique())
     writers = {topic: (names, kinds) for topic, names, kinds in by.iter_rows()}
     for topic, name in {
@@ -140,11 +145,15 @@ def test_every_instance_is_what_its_callback_notes(ran: Ran, kind: str) -> None:
     conditions = {"triggered"} if kind != "events" else set()
     assert check_each(flow, notes) >= EVERY | conditions | {"take/done", "take/asked", "take/later"}
     check_outputs(flow)
-    assert not flow.instances.filter(pl.col("assumed")).filter(
-        ~pl.col("callback_id").is_in(
-            flow.objects.callbacks.filter(kind="client")["callback_id"].implode()
+    assert (
+        not flow.instances.filter(pl.col("assumed"))
+        .filter(
+            ~pl.col("callback_id").is_in(
+                flow.objects.callbacks.filter(kind="client")["callback_id"].implode()
+            )
         )
-    ).height
+        .height
+    )
     timers = flow.objects.callbacks.filter(kind="timer").select("node", "symbol").rows()
     nodes = {symbol.split(".")[-1]: node for node, symbol in timers}
     assert nodes == {"tick": "/sensor", "tock": "/sensor", "alarm": "/worker"}

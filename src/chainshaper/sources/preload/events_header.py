@@ -73,7 +73,8 @@ def hook_header() -> str:
     """Return the text of `rclpy_hook.h`: `rclpy_hook.py` as a string of C."""
     lines = Path(__file__).with_name("rclpy_hook.py").read_text("ascii").splitlines()
     escaped = (line.replace("\\", r"\\").replace('"', r"\"") for line in lines)
-    return "static const char rclpy_hook[] =\n%s;\n" % "\n".join(f'  "{line}\\n"' for line in escaped)
+    text = "\n".join(f'  "{line}\\n"' for line in escaped)
+    return f"static const char rclpy_hook[] =\n{text};\n"
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Have callbacks of rclpy say when they begin and end, as those of rclcpp do by themselves.
 
-This file is run, not imported: by the interpreter of a node, from the text that the library in front
-of ROS 2 carries (`in_python.h`), while `rclpy.init` calls `rcl_init`. So it is Python 3.8, imports
-nothing of ours, and finds as globals what the library gives:
+This file is run, not imported: by the interpreter of a node, from the text that the library in
+front of ROS 2 carries (`in_python.h`), while `rclpy.init` calls `rcl_init`. So it is Python 3.8,
+imports nothing of ours, and finds as globals what the library gives:
 
 * ``traced(callback)``: a function that calls the callback and emits `callback_start` and
   `callback_end`; and its handle.
@@ -10,9 +10,9 @@ nothing of ours, and finds as globals what the library gives:
 * ``step(callback, call, state)``: emits `coroutine_step`.
 
 What rclpy runs is the attribute `callback` of a timer, subscription, service or guard condition,
-whichever executor runs it: this attribute becomes one that gives a traced callback. What is set stays
-what it was; whatever is not as expected leaves the callback as it is. ``problem`` says of what
-nothing is traced (empty: all is), None that there is no rclpy yet.
+whichever executor runs it: this attribute becomes one that gives a traced callback. What is set
+stays what it was; whatever is not as expected leaves the callback as it is. ``problem`` says of
+what nothing is traced (empty: all is); None: there is no rclpy yet.
 """
 
 import functools
@@ -20,7 +20,14 @@ import inspect
 import itertools
 import sys
 import types
+from typing import Any, Callable, List, Optional, Tuple, Type
 
+# What the library gives.
+traced: Callable[[Any], Tuple[Any, int]]
+registered: Callable[[int, int, int, int, str], None]
+step: Callable[[int, int, int], None]
+
+Change = Tuple[Type[Any], str, Callable[..., Any]]
 TIMER, SUBSCRIPTION, SERVICE, OF_NODE, TIMER_OF_NODE = range(5)
 BEGINS, RUNS, WAITS, DONE, CREATED = range(5)
 TRACED, HANDLE, NODE = "_chainshaper_traced", "_chainshaper_handle", "_chainshaper_node"
@@ -35,7 +42,7 @@ calls = itertools.count(1)
 
 
 @types.coroutine
-def steps(coroutine, handle, call):
+def steps(coroutine: Any, handle: int, call: int) -> Any:
     """Run a coroutine as `await` does; emit when it runs, when it waits, and when it is done."""
     value = error = None
     step(handle, call, BEGINS)
@@ -65,11 +72,11 @@ def steps(coroutine, handle, call):
             error = thrown
 
 
-def traced_callback(callback):
-    """Return a callback that emits its events, and can do all that this one can; with its handle."""
+def traced_callback(callback: Any) -> Any:
+    """Return a callback that emits its events and can do all that this one can."""
     if inspect.iscoroutinefunction(callback):
 
-        async def run(*arguments, **named):
+        async def run(*arguments: Any, **named: Any) -> Any:
             coroutine = callback(*arguments, **named)
             if not inspect.iscoroutine(coroutine):
                 return await coroutine
@@ -84,12 +91,12 @@ def traced_callback(callback):
     return run
 
 
-def untraced(callback):
+def untraced(callback: Any) -> Any:
     """Return what was traced: the callback of one entity may be given to another one."""
     return callback.__wrapped__ if HANDLE in getattr(callback, "__dict__", ()) else callback
 
 
-def symbol_of(callback):
+def symbol_of(callback: Any) -> str:
     """Return a callback's name."""
     while isinstance(callback, functools.partial):
         callback = callback.func
@@ -98,7 +105,7 @@ def symbol_of(callback):
     return (module + "." if isinstance(module, str) else "") + name
 
 
-def register(kind, entity, run):
+def register(kind: Optional[int], entity: Any, run: Any) -> bool:
     """Emit which entity a traced callback belongs to; return whether it could be done."""
     if kind is None:
         return True
@@ -112,11 +119,11 @@ def register(kind, entity, run):
     return True
 
 
-def follow_callbacks(entity_class, kind):
+def follow_callbacks(entity_class: Any, kind: Optional[int]) -> None:
     """Have the attribute `callback` of a class give traced callbacks."""
     before = getattr(entity_class, "callback", None)  # a property, or there is none
 
-    def raw(entity):
+    def raw(entity: Any) -> Any:
         if before is not None:
             return before.__get__(entity, type(entity))
         try:
@@ -124,7 +131,7 @@ def follow_callbacks(entity_class, kind):
         except KeyError:
             raise AttributeError("callback") from None
 
-    def read(entity):
+    def read(entity: Any) -> Any:
         callback = raw(entity)
         entry = entity.__dict__.get(TRACED)
         if entry is None or entry[0] is not callback:
@@ -133,7 +140,7 @@ def follow_callbacks(entity_class, kind):
             entry[2] = register(kind, entity, entry[1])
         return entry[1]
 
-    def write(entity, callback):
+    def write(entity: Any, callback: Any) -> None:
         callback = untraced(callback)
         if before is not None:
             before.__set__(entity, callback)
@@ -153,14 +160,14 @@ def follow_callbacks(entity_class, kind):
     entity_class.callback = property(read, write)
 
 
-def follow_owners(node_class):
+def following_owners(node_class: Any) -> List[Change]:
     """Have a node say which timers and guard conditions are its own when it creates them."""
 
-    def linking(name, link):
+    def linking(name: str, link: Callable[[Any, int], None]) -> Change:
         create = getattr(node_class, name)
 
         @functools.wraps(create)
-        def created(self, *arguments, **named):
+        def created(self: Any, *arguments: Any, **named: Any) -> Any:
             entity = create(self, *arguments, **named)
             try:
                 link(entity, self.handle.pointer)
@@ -168,42 +175,41 @@ def follow_owners(node_class):
                 pass
             return entity
 
-        return name, created
+        return node_class, name, created
 
-    def link_timer(timer, node):
+    def link_timer(timer: Any, node: int) -> None:
         entry = timer.__dict__.get(TRACED)
         timer.__dict__[NODE] = node
         if entry is not None and entry[2]:
             registered(TIMER_OF_NODE, timer.handle.pointer, 0, node, "")
-        timer.callback  # which registers it, if it is not
+        getattr(timer, "callback", None)  # which registers it, if it is not
 
-    def link_condition(condition, node):
+    def link_condition(condition: Any, node: int) -> None:
         run = condition.__dict__[TRACED][1]
         registered(OF_NODE, 0, run.__dict__[HANDLE], node, symbol_of(run.__wrapped__))
 
-    created = [
+    return [
         linking("create_timer", link_timer),
         linking("create_guard_condition", link_condition),
     ]
-    return [(node_class, *one) for one in created]
 
 
-def traced_task(callback, call):
+def traced_task(callback: Any, call: int) -> Any:
     """Return what runs a task, a function, a coroutine function or a coroutine, with its events."""
     if inspect.iscoroutinefunction(callback):
 
-        async def run(*arguments, **named):
+        async def run(*arguments: Any, **named: Any) -> Any:
             return await steps(callback(*arguments, **named), 0, call)
 
     elif inspect.iscoroutine(callback):
 
-        async def run():
+        async def run_on() -> Any:
             return await steps(callback, 0, call)
 
-        return run()
+        return run_on()
     elif callable(callback):
 
-        def run(*arguments, **named):
+        def run(*arguments: Any, **named: Any) -> Any:
             step(0, call, BEGINS)
             try:
                 return callback(*arguments, **named)
@@ -215,12 +221,12 @@ def traced_task(callback, call):
     return functools.update_wrapper(run, callback)
 
 
-def following_tasks(executor_class):
+def following_tasks(executor_class: Any) -> Change:
     """Have tasks say when they run, and in which callback they were created."""
     create = executor_class.create_task
 
     @functools.wraps(create)
-    def create_task(self, callback, *arguments, **named):
+    def create_task(self: Any, callback: Any, *arguments: Any, **named: Any) -> Any:
         try:
             call = next(calls)
             task = traced_task(callback, call)
@@ -232,11 +238,12 @@ def following_tasks(executor_class):
     return executor_class, "create_task", create_task
 
 
-def follow():
+def follow() -> str:
     """Follow all that there is of rclpy; return what is not followed."""
     __import__("rclpy.node")
     __import__("rclpy.executors")
-    problems, changes = [], []
+    problems: List[str] = []
+    changes: List[Change] = []
     for module, name, kind in ENTITIES:
         try:
             follow_callbacks(getattr(sys.modules[module], name), kind)
@@ -247,7 +254,7 @@ def follow():
     if hasattr(native, "EventsExecutor"):
         classes.append(native.EventsExecutor)
     try:
-        changes += follow_owners(sys.modules["rclpy.node"].Node)
+        changes += following_owners(sys.modules["rclpy.node"].Node)
         changes += map(following_tasks, classes)
         for changed in changes:
             setattr(*changed)
@@ -257,7 +264,7 @@ def follow():
 
 
 rclpy = sys.modules.get("rclpy")
-problem = None
+problem: Optional[str] = None
 if rclpy is not None:
     try:
         problem = follow()
