@@ -12,7 +12,9 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import rclpy
 from rcl_interfaces.srv import ListParameters
@@ -23,10 +25,10 @@ from rclpy.qos import QoSProfile
 from rclpy.task import Future
 from sensor_msgs.msg import Imu, Temperature
 
-notes = []
+notes: list[dict[str, Any]] = []
 
 
-def busy(duration):
+def busy(duration: float) -> None:
     until = time.thread_time() + duration
     while time.thread_time() < until:
         pass
@@ -35,27 +37,28 @@ def busy(duration):
 class Note:
     """Notes an instance from when its callback begins, on the thread that runs it."""
 
-    def __init__(self, callback, node):
-        self.kept = {"callback": callback, "node": node.get_name(), "tids": [], "runs": []}
+    def __init__(self, callback: str, node: Any) -> None:
+        self.kept: dict[str, Any] = {"callback": callback, "node": node.get_name()}
+        self.kept |= {"tids": [], "runs": []}
         self.run()
 
-    def run(self):
+    def run(self) -> None:
         self.kept["tids"].append(threading.get_native_id())
         self.kept["runs"].append([time.monotonic_ns(), 0])
 
-    def wait(self):
+    def wait(self) -> None:
         self.kept["runs"][-1][1] = time.monotonic_ns()
 
-    def done(self):
+    def done(self) -> None:
         self.wait()
         notes.append(self.kept)
 
 
-def noted(function):
+def noted(function: Callable[..., Any]) -> Callable[..., Any]:
     """The method notes each of its calls, also of one that raises."""
 
     @functools.wraps(function)
-    def noting(self, *arguments):
+    def noting(self: Any, *arguments: Any) -> Any:
         note = Note(function.__name__, self)
         try:
             return function(self, *arguments)
@@ -65,19 +68,19 @@ def noted(function):
     return noting
 
 
-class Sensor(Node):
-    def __init__(self, raises):
+class Sensor(Node):  # type: ignore[misc]
+    def __init__(self, raises: bool) -> None:
         super().__init__("sensor")
         self.raises, self.calls = raises, 0
         self.output = self.create_publisher(Imu, "/raw", 10)
         self.slow = self.create_publisher(Temperature, "/slow", 10)
 
-    def begin(self):
+    def begin(self) -> None:
         """Called when the other nodes are there: the last one made is not this timer's node."""
         self.timers_ = [self.create_timer(0.03, self.tick), self.create_timer(0.05, self.tock)]
 
     @noted
-    def tick(self):
+    def tick(self) -> None:
         self.calls += 1
         busy(0.002)
         self.output.publish(Imu())
@@ -85,13 +88,13 @@ class Sensor(Node):
             raise ArithmeticError("as asked for")
 
     @noted
-    def tock(self):
+    def tock(self) -> None:
         busy(0.001)
         self.slow.publish(Temperature())
 
 
-class Worker(Node):
-    def __init__(self, kind):
+class Worker(Node):  # type: ignore[misc]
+    def __init__(self, kind: str) -> None:
         super().__init__("worker")
         group = ReentrantCallbackGroup()
         self.outputs = {
@@ -107,28 +110,28 @@ class Worker(Node):
         self.create_subscription(Imu, "/raw", self.ask, qos, callback_group=group)
         self.create_subscription(Temperature, "/slow", self.sleep, qos, callback_group=group)
         self.create_subscription(Temperature, "/slow", self.hand_over, qos, callback_group=group)
-        self.due = []
+        self.due: list[tuple[float, Any]] = []
         self.create_timer(0.01, self.alarm, callback_group=group)
 
     @noted
-    def work(self, message):
+    def work(self, message: Any) -> None:
         busy(0.003)
         self.outputs["/done"].publish(message)
         if self.condition:
             self.condition.trigger()
 
     @noted
-    def triggered(self):
+    def triggered(self) -> None:
         busy(0.0005)
         self.outputs["/condition"].publish(Imu())
 
     @noted
-    def judge(self, request, response):
+    def judge(self, request: Any, response: Any) -> Any:
         busy(0.001)
         response.result.names = request.prefixes
         return response
 
-    async def ask(self, message):
+    async def ask(self, message: Any) -> None:
         """A coroutine that waits for a service of its own executor."""
         note = Note("ask", self)
         busy(0.001)
@@ -140,7 +143,7 @@ class Worker(Node):
         self.outputs["/asked"].publish(message)
         note.done()
 
-    async def sleep(self, _):
+    async def sleep(self, _: Any) -> None:
         """A coroutine that waits for a time, and whose instances overlap those of `ask`."""
         note = Note("sleep", self)
         for _ in range(2):
@@ -154,37 +157,37 @@ class Worker(Node):
         note.done()
 
     @noted
-    def alarm(self):
+    def alarm(self) -> None:
         for entry in [entry for entry in self.due if entry[0] < time.monotonic()]:
             self.due.remove(entry)
             entry[1].set_result(None)
 
     @noted
-    def hand_over(self, _):
+    def hand_over(self, _: Any) -> None:
         """Leaves its output to a task, and asks a service whose answer another task handles."""
         self.executor.create_task(self.task)
         self.client.call_async(ListParameters.Request()).add_done_callback(self.answered)
 
-    def task(self):
+    def task(self) -> None:
         busy(0.0005)
         self.outputs["/by_task"].publish(Imu())
 
-    def answered(self, _):
+    def answered(self, _: Any) -> None:
         self.outputs["/answered"].publish(Imu())
 
 
-class Sink(Node):
-    def __init__(self):
+class Sink(Node):  # type: ignore[misc]
+    def __init__(self) -> None:
         super().__init__("sink")
         for topic in ("/done", "/asked", "/later"):
             self.create_subscription(Imu, topic, functools.partial(self.take, topic), 10)
 
-    def take(self, topic, _):
+    def take(self, topic: str, _: Any) -> None:
         note = Note("take" + topic, self)
         note.done()
 
 
-def executor_of(name):
+def executor_of(name: str) -> Any:
     if name == "events":
         from rclpy.experimental import EventsExecutor
 
@@ -192,7 +195,7 @@ def executor_of(name):
     return MultiThreadedExecutor(4) if name == "multi" else SingleThreadedExecutor()
 
 
-def main():
+def main() -> None:
     file, kind, seconds, *options = rclpy.utilities.remove_ros_args(sys.argv)[1:]
     rclpy.init()
     sensor = Sensor("raising" in options)

@@ -50,7 +50,8 @@ def coroutine_instances(pieces: pl.DataFrame, owners: pl.DataFrame) -> pl.DataFr
 
     ``pieces`` is the frame of :func:`coroutine_pieces`; ``owners`` has ``callback_id, pid,
     callback, registered``. Columns: those of
-    :func:`~chainshaper.analysis.flow.callback_instances` but ``instance``. An instance has the thread on which it began.
+    :func:`~chainshaper.analysis.flow.callback_instances` but ``instance``. An instance has the
+    thread on which it began.
     """
     calls = (
         pieces.filter(pl.col("callback") != 0)

@@ -201,24 +201,24 @@ def traced_task(callback: Any, call: int) -> Any:
         async def run(*arguments: Any, **named: Any) -> Any:
             return await steps(callback(*arguments, **named), 0, call)
 
-    elif inspect.iscoroutine(callback):
+        return functools.update_wrapper(run, callback)
+    if inspect.iscoroutine(callback):
 
         async def run_on() -> Any:
             return await steps(callback, 0, call)
 
         return run_on()
-    elif callable(callback):
-
-        def run(*arguments: Any, **named: Any) -> Any:
-            step(0, call, BEGINS)
-            try:
-                return callback(*arguments, **named)
-            finally:
-                step(0, call, DONE)
-
-    else:
+    if not callable(callback):
         return callback
-    return functools.update_wrapper(run, callback)
+
+    def run_once(*arguments: Any, **named: Any) -> Any:
+        step(0, call, BEGINS)
+        try:
+            return callback(*arguments, **named)
+        finally:
+            step(0, call, DONE)
+
+    return functools.update_wrapper(run_once, callback)
 
 
 def following_tasks(executor_class: Any) -> Change:
@@ -251,7 +251,7 @@ def follow() -> str:
             problems.append("{}: {!r}".format(name, error))
     classes = [sys.modules["rclpy.executors"].Executor]
     native = sys.modules.get("rclpy._rclpy_pybind11")
-    if hasattr(native, "EventsExecutor"):
+    if native is not None and hasattr(native, "EventsExecutor"):
         classes.append(native.EventsExecutor)
     try:
         changes += following_owners(sys.modules["rclpy.node"].Node)
