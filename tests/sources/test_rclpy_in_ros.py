@@ -110,7 +110,8 @@ def check_each(flow: DataFlow, notes: list[dict[str, Any]]) -> set[str]:
             free.remove(row)
             ran = sum(until - since for since, until in note["runs"])
             around = (row["end"] - row["start"]) - (ended - began)
-            assert row["execution_ns"] <= ran + around, callback
+            # Up to 0.2 ms of what interrupted it may count as its own (docs/record.md).
+            assert row["execution_ns"] <= ran + around + 200_000, callback
         # The program ends in the midst of some coroutines, and before the last notes are made.
         assert len(free) <= 3, (callback, free)
         assert all(row["start"] > of_callback[-1]["runs"][0][0] - 10**9 for row in free)
