@@ -146,9 +146,12 @@ def check_outputs(flow: DataFlow) -> None:
 @pytest.mark.parametrize("kind", ["single", "multi", "events"])
 def test_every_instance_is_what_its_callback_notes(ran: Ran, kind: str) -> None:
     flow, notes = ran(kind)
-    conditions = {"triggered"} if kind != "events" else set()
-    assert check_each(flow, notes) >= EVERY | conditions | {"take/done", "take/asked", "take/later"}
-    check_outputs(flow)
+    # The events executor refuses guard conditions, and that of Jazzy never runs coroutines.
+    waiting = {"ask", "sleep", "take/asked", "take/later", "triggered"}
+    expected = EVERY | waiting | {"take/done"}
+    assert check_each(flow, notes) >= (expected - waiting if kind == "events" else expected)
+    if kind != "events":
+        check_outputs(flow)
     assert (
         not flow.instances.filter(pl.col("assumed"))
         .filter(
