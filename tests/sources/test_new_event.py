@@ -35,6 +35,7 @@ folder, source, compiler = map(Path, sys.argv[1:])
 header = events_header.events_header(declarations.events_of_library())
 text = f"{header}#define FORMAT {events_header.format_of(header)}u\\n"
 (folder / "events.h").write_text(text)
+(folder / "rclpy_hook.h").write_text(events_header.hook_header())
 library = folder / "libtrace.so"
 subprocess.run(
     [compiler, "-std=gnu11", "-shared", "-fPIC", f"-I{folder}", source, "-o", library, "-ldl"],

@@ -107,7 +107,7 @@ def test_every_argument_of_every_function_arrives_as_it_was_passed(
 ) -> None:
     assert_everything(*everything, WAITING)
     emitted = {row[0] for rows in everything[1].values() for row in rows}
-    apart = {"rcl_timer_call", *OURS, *SERVICE_CALLS}
+    apart = {"rcl_timer_call", *OURS, *OF_RCLPY, *SERVICE_CALLS}
     apart |= {"controller_manager_found", "controller_manager_call"}
     assert set(event_names()) - emitted == apart, "tested apart"
 
@@ -254,6 +254,7 @@ for subscription, message in ((1, 9), (2, 9), (2, 0), (2, 9), (3, 9)):
 
 
 OURS = {"loop_named", "loop_moved", "thread_sleep", "thread_wake"}  # of how threads sleep
+OF_RCLPY = {"rclpy_followed", "rclpy_callback_added", "coroutine_step"}
 SERVICE_CALLS = {
     "rmw_send_request": [(1, 2, 41)],
     "rmw_take_request": [(4, 3, [7] * 16, 42, 1234)],

@@ -8,7 +8,9 @@ An instance runs from `callback_start` to `callback_end` of the same callback on
 (paper, section 2.4). Some callbacks have no such events, but their messages prove that they ran.
 For these, instances are assumed (column ``assumed``; they have no ``end`` and no response time):
 
-* A Python node (rclpy), or one that takes from a wait set, has no callback events. An instance of
+* Callbacks of rclpy that are coroutines run in pieces (:mod:`~chainshaper.analysis.coroutines`);
+  they are not assumed, and neither are those that the library in front follows.
+* Another Python node, or one that takes from a wait set, has no callback events. An instance of
   its subscription begins with each take, one of its timer with each `rcl_timer_call`. What the
   thread publishes for the same node until the next such beginning is that instance's output.
 * The callback of a service's client, and what an action's client and server do, begin with the
@@ -28,6 +30,7 @@ from dataclasses import dataclass, field, replace
 
 import polars as pl
 
+from chainshaper.analysis import coroutines
 from chainshaper.analysis.contradictions import (
     Contradiction,
     contradictions,
@@ -53,6 +56,7 @@ from chainshaper.values.application import INTERNAL_TOPICS, REQUEST, RESPONSE
 from chainshaper.values.recording import Recording
 
 _ACTION = "/_action/"
+_MOST_NESTED = 8  # tasks, each created by the one before
 MANY_ROWS = 1_000_000
 """Tables with more rows (tens of MB each) leave memory when the data flow has what they say."""
 
@@ -152,13 +156,15 @@ def data_flow(
     _let_go(tables, ["rmw_publish", "rmw_take"])
     taken, stamped = link_takes(tables, taken, published, clock_offset_ns)
     ends = without_disproved_ends(tables, instances, taken, objects.callbacks, complete=complete)
-    instances = ends.instances
+    pieces = coroutines.coroutine_pieces(tables)
+    instances = _with_coroutines(ends.instances, pieces, objects.callbacks)
     instances, taken = _with_assumed_readers(instances, taken, objects, tables)
     taken = _consumed(taken, instances)
     if "gate_release" in tables:
         taken = _released(taken, instances, gate_decisions(tables, objects))
     taken, unseen = with_unseen_takes(taken, instances, published, objects)
-    published = _published_in(published, instances, objects)
+    running = _running(instances, pieces, tables, objects)
+    published = _published_in(published, running, objects)
     if "rcl_timer_call" not in tables and instances["assumed"].any():
         published = _begun_outside(published, instances)
     if sent.height and received.height:
@@ -277,9 +283,7 @@ def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> p
     starts = events.table(tables, "callback_start", ["is_intra_process"])
     ends = events.table(tables, "callback_end")
     row = ends_of_starts(starts, ends)
-    owners = callbacks.filter(pl.col("observed")).select(
-        "callback_id", "pid", callback="handle", registered="valid_from"
-    )
+    owners = _owners(callbacks)
     started = starts.select("pid", "callback", "time")  # in order of time, and stays so
     used = pl.lit(None, dtype=pl.Int64)
     if "thread_time" in starts.columns and "thread_time" in ends.columns:
@@ -299,6 +303,59 @@ def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> p
     if "sched_switch" in tables and not frame["execution_ns"].count():
         frame = _plausible(frame.with_columns(execution_ns=cpu_time(tables, frame)))
     return frame.with_row_index("instance")
+
+
+def _owners(callbacks: pl.DataFrame) -> pl.DataFrame:
+    """Select the registrations of callbacks that have events."""
+    return callbacks.filter(pl.col("observed")).select(
+        "callback_id", "pid", callback="handle", registered="valid_from"
+    )
+
+
+def _with_coroutines(
+    instances: pl.DataFrame, pieces: pl.DataFrame, callbacks: pl.DataFrame
+) -> pl.DataFrame:
+    """Add the instances of callbacks that are coroutines, and number all anew."""
+    if pieces.is_empty():
+        return instances
+    added = coroutines.coroutine_instances(pieces, _owners(callbacks))
+    together = pl.concat([instances.drop("instance"), added], how="diagonal_relaxed")
+    together = together.sort("start", maintain_order=True).with_row_index("instance")
+    return together.select(instances.columns)
+
+
+def _running(
+    instances: pl.DataFrame, pieces: pl.DataFrame, tables: events.EventTables, objects: Objects
+) -> pl.DataFrame:
+    """Make a frame of what ran on which thread: instances; of coroutines and tasks their pieces.
+
+    A task counts as the instance in which it was created, which may be that of another task.
+    """
+    columns = ["instance", "callback_id", "pid", "tid", "start", "end", "until", "assumed"]
+    if pieces.is_empty():
+        return instances.select(columns)
+    pieces = coroutines.instances_of_pieces(pieces, instances)
+    known = pieces.drop_nulls("instance")
+    whole = instances.join(known, on="instance", how="anti", maintain_order="left").select(columns)
+
+    def beside(added: pl.DataFrame) -> pl.DataFrame:
+        added = added.with_columns(assumed=pl.lit(False))
+        together = pl.concat([whole, added.select({*columns} - {"until"})], how="diagonal_relaxed")
+        return together.select(columns).sort("start", maintain_order=True)
+
+    running = beside(known)
+    created = coroutines.created_tasks(tables).with_row_index("publication")
+    created = created.with_columns(node=pl.lit(None, pl.String))
+    tasks = pieces.filter(pl.col("callback") == 0).drop("instance", "callback_id")
+    numbers: list[int | None] = []
+    for _ in range(_MOST_NESTED if created.height else 0):
+        owned = _published_in(created, running, objects, of_any_node=True)
+        if (latest := owned["instance"].to_list()) == numbers:
+            break
+        numbers = latest
+        owner = owned.drop_nulls("instance").select("pid", "call", "instance", "callback_id")
+        running = beside(pl.concat([known, tasks.join(owner, on=["pid", "call"])], how="diagonal"))
+    return running
 
 
 def cpu_time(tables: events.EventTables, spans: pl.DataFrame) -> pl.Series:
@@ -486,9 +543,11 @@ def _answered(published: pl.DataFrame, taken: pl.DataFrame) -> pl.DataFrame:
 
 
 def _published_in(
-    published: pl.DataFrame, instances: pl.DataFrame, objects: Objects
+    published: pl.DataFrame, running: pl.DataFrame, objects: Objects, *, of_any_node: bool = False
 ) -> pl.DataFrame:
     """Add ``instance`` and ``callback_id``: the innermost instance then running on the thread.
+
+    ``running`` is the frame of :func:`_running`. ``of_any_node``: the rows have no nodes.
 
     An instance without an end is taken to run until the thread's next instance, or until its thread
     looked for other work. A publication in the nanosecond in which one instance ends and the next
@@ -498,12 +557,11 @@ def _published_in(
     """
     nodes = objects.callbacks.unique("callback_id", maintain_order=True)
     nodes = nodes.select("callback_id", owner=pl.col("node").cast(published.schema["node"]))
-    running = instances.drop("execution_ns", "intra_process")
     running = running.join(nodes, on="callback_id", how="left", maintain_order="left")
     key, columns = ["pid", "tid"], ["publication", "instance", "callback_id"]
     over_by = pl.coalesce("end", "until")
     lies_inside = (over_by.is_null() | (pl.col("time") <= over_by)) & (
-        ~pl.col("assumed") | (pl.col("owner") == pl.col("node"))
+        ~pl.col("assumed") | of_any_node | (pl.col("owner") == pl.col("node"))
     )
     left_over, parts, strictly = published.select("publication", "time", *key, "node"), [], True
     while True:

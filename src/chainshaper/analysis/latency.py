@@ -147,11 +147,12 @@ def executors(flow: DataFlow) -> list[RecordedExecutor]:
         ran.group_by("callback_id", "pid").agg(tids=pl.col("tid").sort()),
         on=["callback_id", "pid"],
     )
+    in_python = {*events.table(flow.events, "rclpy_followed")["pid"]}
     # A timer's declared period names it: it is the same whatever the recording shows.
     columns = ("callback_id", "node", "kind", "topic", "declared_ns", "pid", "tids", "observed")
     for row in known.sort("callback_id").select(*columns).iter_rows():
         number, node, kind, topic, declared_ns, pid, tids, observed = row
-        tids = tids if observed else {pid, *tids}
+        tids = tids if observed and pid not in in_python else {pid, *tids}
         threads: dict[int, tuple[str, ...]] = dict.fromkeys(tids, (node,))
         callbacks, names = frozenset((number,)), tuple[tuple[str, str], ...]()
         if kind in ("timer", "subscription") and topic not in INTERNAL_TOPICS:

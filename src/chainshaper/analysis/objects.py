@@ -89,6 +89,7 @@ def resolve_objects(tables: events.EventTables) -> Objects:
         _subscription_callbacks(tables, subscriptions),
         _timer_callbacks(tables, nodes),
         _service_callbacks(tables, ends, subscriptions),
+        _of_conditions(tables, nodes),
     ]
     registered = pl.concat(with_events, how="diagonal_relaxed")
     unknown = _unregistered(tables, registered)
@@ -299,11 +300,22 @@ def _unregistered(tables: events.EventTables, registered: pl.DataFrame) -> pl.Da
     key = ["pid", "handle"]
     known = registered.group_by(key).agg(valid_to=pl.col("valid_from").min())
     started = events.table(tables, "callback_start").lazy().select("pid", "time", handle="callback")
+    coroutines = events.table(tables, "coroutine_step").lazy().filter(pl.col("callback") != 0)
+    coroutines = coroutines.select("pid", "time", handle="callback")
+    started = pl.concat([started, coroutines])
     first = started.group_by(key).agg(valid_from=pl.col("time").min()).collect()
     first = first.join(known, on=key, how="left")
     early = pl.col("valid_to").is_null() | (pl.col("valid_from") < pl.col("valid_to"))
     unknown = first.with_columns(kind=pl.lit("unknown"), observed=pl.lit(True))
     return unknown.filter(early).sort("valid_from", *key)
+
+
+def _of_conditions(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
+    """Make a frame of the callbacks of rclpy's guard conditions: only their node is known."""
+    added = events.table(tables, "rclpy_callback_added")
+    added = added.select("pid", "node_handle", handle="callback", valid_from="time")
+    added = _with_node(added, nodes, "valid_from").with_columns(kind=pl.lit("unknown"))
+    return added.select("pid", "handle", "valid_from", "node", "kind")
 
 
 def _subscriptions_by_takes(
@@ -425,7 +437,12 @@ def _activity(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
 
 def _notes(tables: events.EventTables, callbacks: pl.DataFrame) -> tuple[str, ...]:
     notes: list[str] = []
-    unknown = callbacks.filter(pl.col("kind") == "unknown")
+    unknown = callbacks.filter(pl.col("kind") == "unknown", pl.col("symbol").is_null())
+    for problem, pids in _problems_of_rclpy(tables):
+        notes.append(
+            f"callbacks of rclpy in process {pids} are inferred, not followed ({problem}): an"
+            " instance begins with its message's take or its timer's call, and has no end."
+        )
     if len(unknown):
         processes = ", ".join(map(str, unknown["pid"].unique().sort()))
         notes.append(
@@ -454,6 +471,13 @@ def _notes(tables: events.EventTables, callbacks: pl.DataFrame) -> tuple[str, ..
         for node, topic in silent.select("node", "topic").iter_rows()
     ]
     return tuple(notes)
+
+
+def _problems_of_rclpy(tables: events.EventTables) -> list[tuple[str, str]]:
+    """List why callbacks of rclpy emit no events, and in which processes."""
+    failed = events.table(tables, "rclpy_followed").filter(pl.col("problem") != "")
+    failed = failed.group_by("problem", maintain_order=True).agg(pl.col("pid").unique().sort())
+    return [(problem, ", ".join(map(str, pids))) for problem, pids in failed.iter_rows()]
 
 
 def numbered(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFrame:

@@ -585,7 +585,43 @@ LOOP_MOVES = (
 # its turns, by the numbers in `controller_manager_call`.
 MANAGER_FUNCTIONS = ("read", "update", "write")
 
+# What a coroutine did, by the numbers in `coroutine_step`.
+COROUTINE_STATES = (
+    "begins",  # to run, on the event's thread
+    "runs",  # from here on, after it waited
+    "waits",  # and gives its thread back
+    "done",
+    "created",  # a task, in the callback that then runs: it is run later
+)
+
 _OURS = (
+    # The library in front met rclpy: its callbacks emit events from here on.
+    Event(
+        "rclpy_followed",
+        "creation",
+        (EventField("problem", "text", 0),),  # which ones do not, and why; empty: all do
+        recorded_by_library="arguments",
+    ),
+    # A callback of rclpy that is neither a timer's nor a message's: that of a guard condition.
+    Event(
+        "rclpy_callback_added",
+        "creation",
+        (EventField("callback", "address", 0), EventField("node_handle", "address", 1)),
+        recorded_by_library="arguments",
+    ),
+    # A callback of rclpy that is a coroutine gets a thread, or gives it back; or a task does, which
+    # a callback created.
+    Event(
+        "coroutine_step",
+        "messages",
+        (
+            EventField("callback", "address", 0),  # 0: a task
+            EventField("call", "count", 1),  # which call of it, or which task, of its process
+            EventField("thread_time", "nanoseconds", 2),
+            EventField("state", "count", 3),  # place in COROUTINE_STATES
+        ),
+        recorded_by_library="arguments",
+    ),
     # The user named a loop by its node, which was created in this process (`is_thread` 0), or by
     # the name of its thread, which is the event's `tid`.
     Event(

@@ -258,6 +258,8 @@ def _traced(callback: Callable[..., None]) -> Callable[..., None]:
         finally:
             emit("callback_end", handle)
 
+    # The library in front traces callbacks of rclpy that do not say this.
+    vars(traced)["chainshaper_emits_events"] = True
     handle = id(traced)
     return traced
 
@@ -299,6 +301,7 @@ def create_subscription(
             take(id(payload), time.time_ns() if stamp is None else stamp)
             executed(payload)
 
+        vars(taken)["chainshaper_emits_events"] = True
         subscription.callback = taken
     return subscription
 

@@ -1,4 +1,4 @@
-"""`events.h`: the events that `preload.c` records, as their declarations have them.
+"""`events.h`: the events that `preload.c` records, as their declarations have them; `rclpy_hook.h`.
 
 `core/preloaded/CMakeLists.txt` runs this file when the library is built. It imports the standard
 library and :mod:`chainshaper.values.event_declarations` only.
@@ -69,6 +69,16 @@ FORMAT = format_of(events_header(events_of_library()))
 """The format of memories that this version writes, and the only one it reads."""
 
 
+def hook_header() -> str:
+    """Return the text of `rclpy_hook.h`: `rclpy_hook.py` as a string of C."""
+    lines = Path(__file__).with_name("rclpy_hook.py").read_text("ascii").splitlines()
+    escaped = (line.replace("\\", r"\\").replace('"', r"\"") for line in lines)
+    text = "\n".join(f'  "{line}\\n"' for line in escaped)
+    return f"static const char rclpy_hook[] =\n{text};\n"
+
+
 if __name__ == "__main__":
     header = events_header(events_of_library())
-    Path(sys.argv[1]).write_text(f"{header}#define FORMAT {format_of(header)}u\n", "utf-8")
+    folder = Path(sys.argv[1])
+    (folder / "events.h").write_text(f"{header}#define FORMAT {format_of(header)}u\n", "utf-8")
+    (folder / "rclpy_hook.h").write_text(hook_header(), "ascii")

@@ -561,7 +561,10 @@ static void created_publisher(uint64_t handle, const char *topic) {
   if (internal || *PLACE(handle) == handle) *PLACE(handle) = internal ? handle : 0;
 }
 
+static void meet_python(void);
+
 static void note_creation(unsigned event, const uint64_t *values) {
+  if (event == number_rcl_init) meet_python();
   if (event == number_rcl_node_init)
     created_node((const char *)(uintptr_t)values[2], (const char *)(uintptr_t)values[3]);
   if (event == number_rcl_publisher_init)
@@ -648,6 +651,8 @@ typedef bool (*question)(void);
        note_creation(number_##name, (uint64_t[6]){a, b, c, d, e}))
 #define NO_HOOK(name)
 ALL_EVENTS(EVENT_HOOK, CREATION_HOOK, NO_HOOK)
+
+#include "in_python.h"
 
 struct request_id {
   uint8_t writer[16];
