@@ -34,7 +34,9 @@ def drifting(
     """
 
     def shown(times: Times) -> Times:
-        result: Times = times + offset_ns + np.rint((times - since_ns) * (ppm / 1e6)).astype(np.int64)
+        result: Times = (
+            times + offset_ns + np.rint((times - since_ns) * (ppm / 1e6)).astype(np.int64)
+        )
         for at, by in steps:
             result = result + np.where(times >= at, by, 0)
         return result
