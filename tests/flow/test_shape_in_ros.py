@@ -14,7 +14,13 @@ from typing import Any, TypeAlias
 import numpy as np
 import polars as pl
 import pytest
-from ros2 import require_lttng_of_ros2, require_packages, ros2_environment
+from ros2 import (
+    MIDDLEWARES,
+    require_lttng_of_ros2,
+    require_packages,
+    ros2_environment,
+    running_middleware,
+)
 
 from chainshaper import (
     load_application,
@@ -300,12 +306,17 @@ def test_each_mode_has_the_slot_of_its_own_profile(
     assert values["recordings"][1]["count"] > 100
 
 
+@pytest.mark.parametrize("rmw", MIDDLEWARES)
 @pytest.mark.parametrize("publication", ["synchronous", "in-process"])
 def test_receivers_get_the_output_at_a_constant_time_behind_it(
-    run: Callable[..., Result], publication: str
+    run: Callable[..., Result], publication: str, rmw: str
 ) -> None:
     options = ("--chain", "/ticked../commands", "--duration", "20s", "--publication", publication)
-    _, folder = run(DRIVING, "shape", "delivered", *options, "--delivery", "2ms")
+    with running_middleware(rmw) as variables:
+        _, folder = run(
+            DRIVING, "shape", "delivered", *options, "--delivery", "2ms", **variables
+        )
+    assert open_recording(folder / "after").info.rmw == rmw
     behind, unshaped = (
         measure_latency(folder / name)
         .analysis.traversals.drop_nulls("reception_ns")

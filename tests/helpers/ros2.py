@@ -7,11 +7,18 @@ needs more names the packages: `@pytest.mark.ros2("rclcpp", "launch_ros")`.
 import functools
 import os
 import shutil
+import socket
 import subprocess
 import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
+
+MIDDLEWARES = ("rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_zenoh_cpp")
+"""The middlewares that chainshaper is run on: tests skip those that are not installed."""
 
 _WHEELS = Path(__file__).parents[2] / ".venv-ros/setup.sh"
 _LISTED_BY_LTTNG = """
@@ -48,6 +55,48 @@ def require_packages(*names: str) -> None:
         place = f"share/ament_index/resource_index/packages/{name}"
         if not any(Path(prefix, place).is_file() for prefix in prefixes):
             pytest.skip(f"the package {name} is not installed in this ROS 2")
+
+
+@contextmanager
+def running_middleware(rmw: str, zenoh: str = "") -> Iterator[dict[str, str]]:
+    """The variables that choose a middleware; Zenoh has its router as long as they are used.
+
+    ``zenoh`` is added to the configuration of Zenoh's nodes and router. A test is skipped where the
+    middleware is not installed.
+    """
+    require_packages(rmw)
+    if rmw != "rmw_zenoh_cpp":
+        yield {"RMW_IMPLEMENTATION": rmw}
+        return
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with zenoh_router(port, zenoh):
+        override = _zenoh_override("connect", port) + zenoh
+        yield {"RMW_IMPLEMENTATION": rmw, "ZENOH_CONFIG_OVERRIDE": override}
+
+
+@contextmanager
+def zenoh_router(port: int, more: str = "") -> Iterator["subprocess.Popen[bytes]"]:
+    """Zenoh's router, which hears nodes at a port of this machine."""
+    override = _zenoh_override("listen", port) + more
+    environment = {**ros2_environment(), "ZENOH_CONFIG_OVERRIDE": override}
+    folders = environment["AMENT_PREFIX_PATH"].split(os.pathsep)
+    programs = (Path(folder, "lib/rmw_zenoh_cpp/rmw_zenohd") for folder in folders)
+    program = next(filter(Path.is_file, programs))
+    with subprocess.Popen([program], env=environment, stdout=subprocess.DEVNULL) as router:
+        try:
+            while router.poll() is None:
+                with suppress(ConnectionRefusedError), socket.create_connection(("127.0.0.1", port)):
+                    break
+                time.sleep(0.05)
+            yield router
+        finally:
+            router.terminate()
+
+
+def _zenoh_override(verb: str, port: int) -> str:
+    return f'{verb}/endpoints=["tcp/127.0.0.1:{port}"]'
 
 
 def require_lttng_of_ros2() -> None:
