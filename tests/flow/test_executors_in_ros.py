@@ -276,7 +276,9 @@ def test_a_chain_through_processes_is_what_they_noted_on_each_middleware(
         first, last = of_origin["timer", origin], of_origin["last", origin]
         assert last.before - first.began <= row["latency_ns"] <= last.behind - row["start"]
     (chain,) = looks[-1]["chains"]
-    print(chain["spans"]["hour"], len(looks))
+    seen, latencies = chain["spans"]["hour"], {*found.traversals["latency_ns"]}
+    assert seen["count"] > 50
+    assert {seen["min_ns"], seen["max_ns"]} <= latencies, "the same events, the same figures"
 
 
 @LAUNCHED

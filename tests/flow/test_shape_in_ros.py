@@ -7,19 +7,26 @@ import json
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Event
 from typing import Any, TypeAlias
 
 import numpy as np
 import polars as pl
 import pytest
+from processes import wait_for
 from ros2 import (
     MIDDLEWARES,
+    free_port,
     require_lttng_of_ros2,
     require_packages,
     ros2_environment,
     running_middleware,
+    zenoh_router,
+    zenoh_variables,
 )
 
 from chainshaper import (
@@ -28,6 +35,7 @@ from chainshaper import (
     measure_latency,
     open_recording,
 )
+from chainshaper.linux.processes import list_processes
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.planning.overruns import cycles_until_output
 
@@ -309,13 +317,14 @@ def test_each_mode_has_the_slot_of_its_own_profile(
 @pytest.mark.parametrize("rmw", MIDDLEWARES)
 @pytest.mark.parametrize("publication", ["synchronous", "in-process"])
 def test_receivers_get_the_output_at_a_constant_time_behind_it(
-    run: Callable[..., Result], publication: str, rmw: str
+    attempt: Callable[..., Attempt], publication: str, rmw: str
 ) -> None:
     options = ("--chain", "/ticked../commands", "--duration", "20s", "--publication", publication)
     with running_middleware(rmw) as variables:
-        _, folder = run(
-            DRIVING, "shape", "delivered", *options, "--delivery", "2ms", **variables
-        )
+        words = (DRIVING, "shape", "delivered", *options, "--delivery", "2ms")
+        done, folder = attempt(*words, **variables)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "process has died" not in done.stderr, "nor do our own nodes, as they end"
     assert open_recording(folder / "after").info.rmw == rmw
     behind, unshaped = (
         measure_latency(folder / name)
@@ -328,6 +337,72 @@ def test_receivers_get_the_output_at_a_constant_time_behind_it(
     assert len(behind) > 100
     assert least >= 2 * MS - MS // 20, "the message is stamped as it is written"
     assert most - least < np.subtract(*np.quantile(unshaped, (0.9, 0.1))) / 2
+
+
+@pytest.mark.parametrize("mode", ["peer", "client"])
+def test_zenohs_router_dies_and_comes_back_while_the_chain_is_shaped(
+    run: Callable[..., Result], tmp_path: Path, mode: str
+) -> None:
+    """Peers need it to meet only. What clients send passes through it: it is lost, and counted."""
+    require_packages("rmw_zenoh_cpp")
+    port, zenoh = free_port(), f';mode="{mode}"' * (mode == "client")
+    killed, back = list[int](), list[int]()
+    folder = Path(os.environ.get("CHAINSHAPER_SHAPED", tmp_path)) / "router"
+
+    def connections() -> int:
+        """How many of them the router has."""
+        lines = Path("/proc/net/tcp").read_text().splitlines()[1:]
+        ends = (line.split()[1:4:2] for line in lines)
+        return sum(local.endswith(f":{port:04X}") and state == "01" for local, state in ends)
+
+    def gated() -> bool:
+        """Whether the chain is shaped, and has been for some cycles."""
+        threads = (thread for process in list_processes() for thread in process.threads)
+        return any(thread.comm.startswith("gate-") for thread in threads)
+
+    def interrupt() -> None:
+        with zenoh_router(port) as router:
+            wait_for(gated, "the gate", 300, 0.5)
+            time.sleep(6)  # of some 20 s
+            assert connections() >= len(DRIVING)
+            killed.append(time.monotonic_ns())
+            router.kill()
+        wait_for(lambda: not connections(), "its connections to end")
+        time.sleep(3)
+        with zenoh_router(port):
+            wait_for(lambda: connections() >= len(DRIVING), "nodes that are connected again", 30)
+            back.append(time.monotonic_ns())
+            ended.wait()
+
+    options = ("--chain", "/ticked../commands", "--duration", "25s", "--publication", "in-process")
+    with ThreadPoolExecutor(1) as aside:
+        ended, interrupting = Event(), aside.submit(interrupt)
+        try:
+            run(DRIVING, "shape", "router", *options, **zenoh_variables(port, zenoh))
+        finally:
+            ended.set()
+        interrupting.result()
+    found = measure_latency(folder / "after").analysis.traversals.sort("start")
+    before, gone, after = (
+        found.filter(pl.col("start").is_between(*span))
+        for span in ((0, killed[0] - 200 * MS), (killed[0], back[0]), (back[0] + 5000 * MS, 2**62))
+    )
+    print(
+        mode,
+        [
+            (
+                one.height,
+                one["complete"].sum(),
+                one.filter("complete")["latency_ns"].min(),
+                one.filter("complete")["latency_ns"].max(),
+            )
+            for one in (before, gone, after)
+        ],
+    )
+    assert before["complete"].all()
+    assert len(gone) > 20
+    assert gone["complete"].all() is (mode == "peer")
+    assert len(after) > 20
 
 
 def _driving(attempt: Callable[..., Attempt], folder: Path, topic: str, duration: str) -> Attempt:

@@ -1,7 +1,7 @@
-"""Real nodes on `rmw_zenoh_cpp` with its router: threads by name, shared memory, a router that dies.
+"""Real nodes on `rmw_zenoh_cpp` with its router: their threads by name, with shared memory too.
 
-Tests for all middlewares, Zenoh among them, are in `test_shape_in_ros.py` and
-`test_executors_in_ros.py`.
+Chains on all middlewares are in `test_executors_in_ros.py`; `test_shape_in_ros.py` shapes them, and
+kills the router meanwhile.
 """
 
 import os
@@ -78,6 +78,5 @@ def test_threads_of_nodes_and_router_are_known_by_name() -> None:
 
 def test_threads_of_shared_memory_appear_with_the_first_large_message() -> None:
     with running_middleware(RMW, SHARED_MEMORY) as variables, nodes(variables) as pids:
-        for pid in pids:
-            complete = {**KINDS, **WATCHDOGS}
-            wait_for(lambda pid=pid: dds_threads(pid) == complete, "its watchdogs")  # type: ignore[misc]
+        complete = [{**KINDS, **WATCHDOGS}] * 2
+        wait_for(lambda: [*map(dds_threads, pids)] == complete, "their watchdogs")

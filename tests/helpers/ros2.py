@@ -68,18 +68,28 @@ def running_middleware(rmw: str, zenoh: str = "") -> Iterator[dict[str, str]]:
     if rmw != "rmw_zenoh_cpp":
         yield {"RMW_IMPLEMENTATION": rmw}
         return
+    port = free_port()
+    with zenoh_router(port, zenoh):
+        yield zenoh_variables(port, zenoh)
+
+
+def free_port() -> int:
+    """A port of this machine at which nothing is heard."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    with zenoh_router(port, zenoh):
-        override = _zenoh_override("connect", port) + zenoh
-        yield {"RMW_IMPLEMENTATION": rmw, "ZENOH_CONFIG_OVERRIDE": override}
+        return int(free.getsockname()[1])
+
+
+def zenoh_variables(port: int, zenoh: str = "") -> dict[str, str]:
+    """The variables of nodes on Zenoh whose router hears them at a port."""
+    override = f'connect/endpoints=["tcp/127.0.0.1:{port}"]{zenoh}'
+    return {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp", "ZENOH_CONFIG_OVERRIDE": override}
 
 
 @contextmanager
-def zenoh_router(port: int, more: str = "") -> Iterator["subprocess.Popen[bytes]"]:
+def zenoh_router(port: int, zenoh: str = "") -> Iterator["subprocess.Popen[bytes]"]:
     """Zenoh's router, which hears nodes at a port of this machine."""
-    override = _zenoh_override("listen", port) + more
+    override = f'listen/endpoints=["tcp/127.0.0.1:{port}"]{zenoh}'
     environment = {**ros2_environment(), "ZENOH_CONFIG_OVERRIDE": override}
     folders = environment["AMENT_PREFIX_PATH"].split(os.pathsep)
     programs = (Path(folder, "lib/rmw_zenoh_cpp/rmw_zenohd") for folder in folders)
@@ -87,16 +97,15 @@ def zenoh_router(port: int, more: str = "") -> Iterator["subprocess.Popen[bytes]
     with subprocess.Popen([program], env=environment, stdout=subprocess.DEVNULL) as router:
         try:
             while router.poll() is None:
-                with suppress(ConnectionRefusedError), socket.create_connection(("127.0.0.1", port)):
+                with (
+                    suppress(ConnectionRefusedError),
+                    socket.create_connection(("127.0.0.1", port)),
+                ):
                     break
                 time.sleep(0.05)
             yield router
         finally:
             router.terminate()
-
-
-def _zenoh_override(verb: str, port: int) -> str:
-    return f'{verb}/endpoints=["tcp/127.0.0.1:{port}"]'
 
 
 def require_lttng_of_ros2() -> None:
