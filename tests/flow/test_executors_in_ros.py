@@ -238,7 +238,9 @@ def test_a_chain_through_processes_is_what_they_noted_on_each_middleware(
     program: Path, tmp_path: Path, rmw: str
 ) -> None:
     """Recorded and watched at once: the same library is in front of all nodes."""
-    nodes = [(str(program), "sink", str(tmp_path / "sink"), "single", "sink")]
+    nodes: list[tuple[str, ...]] = [
+        (str(program), "sink", str(tmp_path / "sink"), "single", "sink")
+    ]
     for name, topics in STAGES.items():
         words = ("single", "stage", "60", "5", "20", "sleep", name, *topics)
         nodes.append((str(program), name, str(tmp_path / name), *words))
