@@ -3,12 +3,16 @@
 import io
 import json
 import os
+import shutil
+import subprocess
 import time
 from pathlib import Path
 
 import pytest
 import yaml
 from command_line import called, chainshaper, json_of, refused
+from known import known
+from processes import wait_for
 from rich.console import Console
 from small_chain import DDS_CORE, EXECUTOR_CORE, small_chain_text
 
@@ -112,7 +116,6 @@ def test_doctor_as_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         ("ROS_DISTRO=humble", "have no names"),
         ("RMW_IMPLEMENTATION=rmw_cyclonedds_cpp", "rmw_cyclonedds_cpp"),
         ("RMW_IMPLEMENTATION=rmw_cyclonedds_cpp CYCLONEDDS_URI=<x:name='iox'/>", "iceoryx"),
-        ("RMW_IMPLEMENTATION=rmw_zenoh_cpp ROS_DISTRO=kilted", "Zenoh"),
         ("RMW_IMPLEMENTATION=rmw_connextdds", "RTI Connext"),
         ("RMW_IMPLEMENTATION=rmw_own_cpp", "rmw_own_cpp is not known"),
     ],
@@ -128,6 +131,24 @@ def test_doctor_says_what_is_limited_on_a_middleware(
     assert [(found or "") in check.found for check in checks] == [True] * bool(found)
     works = found in ("rmw_cyclonedds_cpp", "rmw_fastrtps_cpp")
     assert {check.state for check in checks} <= {"good" if works else "limited"}
+
+
+def test_doctor_says_whether_zenohs_router_runs(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_zenoh_cpp")
+    router = tmp_path / "rmw_zenohd"
+    shutil.copy(known(shutil.which("sleep")), router)
+    with subprocess.Popen([router, "60"]) as process:
+        wait_for(lambda: "(process " in str(list(doctor._middleware())), "the router", 10)
+        middleware, check = doctor._middleware()
+        assert (middleware.state, middleware.found) == ("good", "rmw_zenoh_cpp")
+        assert check.found.startswith("rmw_zenohd (process "), "another router may run here"
+        process.kill()
+    monkeypatch.setattr(doctor, "list_processes", tuple)
+    _, check = doctor._middleware()
+    assert (check.state, check.found) == ("limited", "none runs on this machine")
+    assert "ros2 run rmw_zenoh_cpp rmw_zenohd" in check.remedy
 
 
 def test_tables_are_for_people(

@@ -2,12 +2,14 @@
 // when; messages carry the number of their origin in `frame_id`:
 //
 //   executing LOG EXECUTOR line|join PERIOD_MS LEAST_MS MOST_MS compute|sleep
+//   executing LOG EXECUTOR stage PERIOD_MS LEAST_MS MOST_MS compute|sleep CALLBACK INPUT|- OUTPUT
 //   executing LOG EXECUTOR sink
 //   executing LOG EXECUTOR known   (exit code 1: this rclcpp has no such executor)
 //
 // line: a timer → /begun → /worked → /done; the second callback is in a reentrant group, the others
 // in one of their own; the last works for a tenth of the time. join: the timer publishes /left and /right, and the callback that gets the
-// second message of an origin works and publishes /done, without the lock of its sets.
+// second message of an origin works and publishes /done, without the lock of its sets. stage: one
+// callback of a line, a timer without an input.
 #include <sys/syscall.h>
 #include <unistd.h>
 
@@ -68,8 +70,13 @@ class Worker : public rclcpp::Node {
     }
     time_ms_ = std::uniform_real_distribution<double>(std::stod(words[5]), std::stod(words[6]));
     sleeps_ = words[7] == "sleep";
-    const bool line = words[3] == "line";
-    const auto outputs = line ? publishers({"/begun"}) : publishers({"/left", "/right"});
+    const bool line = words[3] == "line", stage = words[3] == "stage";
+    if (stage && words[9] != "-") {
+      name_ = words[8];
+      subscribe(name_.c_str(), words[9].c_str(), groups[0], publishers({words[10]}));
+      return;
+    }
+    const auto outputs = line ? publishers({"/begun"}) : publishers(stage ? Topics{words[10]} : Topics{"/left", "/right"});
     timer_ = create_wall_timer(std::chrono::milliseconds(std::stoi(words[4])), [this, outputs] {
       Message begun;
       const auto began = now_ns(CLOCK_MONOTONIC);
@@ -80,7 +87,7 @@ class Worker : public rclcpp::Node {
     if (line) {
       subscribe("work", "/begun", groups[1], publishers({"/worked"}));
       subscribe("last", "/worked", groups[2], publishers({"/done"}));
-    } else {
+    } else if (!stage) {
       const auto done = publishers({"/done"});
       subscribe("left", "/left", groups[1], done, true);
       subscribe("right", "/right", groups[1], done, true);
@@ -90,8 +97,9 @@ class Worker : public rclcpp::Node {
 
  private:
   using Outputs = std::vector<rclcpp::Publisher<Message>::SharedPtr>;
+  using Topics = std::vector<std::string>;
 
-  Outputs publishers(const std::vector<std::string>& topics) {
+  Outputs publishers(const Topics& topics) {
     Outputs found;
     for (const auto& topic : topics) found.push_back(create_publisher<Message>(topic, 50));
     return found;
@@ -137,6 +145,7 @@ class Worker : public rclcpp::Node {
   Notes& notes_;
   std::uniform_real_distribution<double> time_ms_;
   bool sleeps_ = false;
+  std::string name_;
   int origin_ = 0;
   std::mutex mutex_;
   std::set<std::string> waiting_;

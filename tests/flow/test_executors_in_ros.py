@@ -6,8 +6,10 @@ handled, on which thread and when. ``CHAINSHAPER_SHAPED=FOLDER`` has the recordi
 
 import json
 import os
+import signal
 import subprocess
 import sys
+from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable
 from itertools import accumulate
@@ -16,7 +18,8 @@ from typing import Any, NamedTuple, TypeAlias
 
 import polars as pl
 import pytest
-from ros2 import require_lttng_of_ros2, ros2_environment
+from known import known
+from ros2 import MIDDLEWARES, require_lttng_of_ros2, ros2_environment, running_middleware
 
 from chainshaper import load_plan, open_recording
 from chainshaper.analysis import analyse_latency, data_flow, executors
@@ -220,6 +223,64 @@ def test_traversals_and_threads_are_what_the_callbacks_say(
         assert ran_by <= {tid for one in own for tid in one.threads}
     else:  # rclpy's pool begins a thread only when none is idle; the main one hands out the work
         assert [{*one.threads} for one in own] == [ran_by | {worker}]
+
+
+STAGES = {  # callback → topics from which and to which it is a stage of the line
+    "timer": ("-", "/begun"),
+    "work": ("/begun", "/worked"),
+    "last": ("/worked", "/done"),
+}
+
+
+@LAUNCHED
+@pytest.mark.parametrize("rmw", MIDDLEWARES)
+def test_a_chain_through_processes_is_what_they_noted_on_each_middleware(
+    program: Path, tmp_path: Path, rmw: str
+) -> None:
+    """Recorded and watched at once: the same library is in front of all nodes."""
+    nodes: list[tuple[str, ...]] = [
+        (str(program), "sink", str(tmp_path / "sink"), "single", "sink")
+    ]
+    for name, topics in STAGES.items():
+        words = ("single", "stage", "60", "5", "20", "sleep", name, *topics)
+        nodes.append((str(program), name, str(tmp_path / name), *words))
+    launch = tmp_path / "robot.launch.py"
+    launch.write_text(LAUNCH.replace("{nodes!r}", repr(nodes)))
+    chainshaper, folder = [sys.executable, "-m", "chainshaper"], tmp_path / "recording"
+    record = [*chainshaper, "record", "-o", str(folder), "--duration", "10s", "--source", "preload"]
+    watch = [*chainshaper, "watch", "--chain", "/begun../done", "--json", "--longest", "1s"]
+    with running_middleware(rmw) as variables:
+        environment = {**ros2_environment(), "ROS_DOMAIN_ID": str(100 + os.getpid() % 100)}
+        environment |= variables
+        recording_nodes = subprocess.Popen(
+            [*record, "--json", "--", "ros2", "launch", str(launch)],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        with subprocess.Popen(watch, env=environment, stdout=subprocess.PIPE, text=True) as watched:
+            _, errors = recording_nodes.communicate()
+            watched.send_signal(signal.SIGINT)
+            looks = [json.loads(line) for line in known(watched.stdout)]
+    assert recording_nodes.returncode == 0, errors[-3000:]
+    notes = tmp_path / "notes"
+    notes.write_text("".join((tmp_path / name).read_text() for name in STAGES))
+    recording = open_recording(folder)
+    assert recording.info.rmw == rmw
+    assert check_traversals(recording, "/begun../done", tuple(STAGES), notes) > 100
+    found = analyse_latency(recording, "/begun../done")
+    of_origin = {(one.callback, one.origin): one for one in noted(notes)}
+    began = {one.began: one.origin for one in noted(notes) if one.callback == "timer"}
+    instants = sorted(began)
+    for row in found.traversals.filter("complete").iter_rows(named=True):
+        origin = began[instants[bisect_left(instants, row["start"])]]
+        first, last = of_origin["timer", origin], of_origin["last", origin]
+        assert last.before - first.began <= row["latency_ns"] <= last.behind - row["start"]
+    (chain,) = looks[-1]["chains"]
+    seen, latencies = chain["spans"]["hour"], {*found.traversals["latency_ns"]}
+    assert seen["count"] > 50
+    assert {seen["min_ns"], seen["max_ns"]} <= latencies, "the same events, the same figures"
 
 
 @LAUNCHED

@@ -7,14 +7,27 @@ import json
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Event
 from typing import Any, TypeAlias
 
 import numpy as np
 import polars as pl
 import pytest
-from ros2 import require_lttng_of_ros2, require_packages, ros2_environment
+from processes import wait_for
+from ros2 import (
+    MIDDLEWARES,
+    free_port,
+    require_lttng_of_ros2,
+    require_packages,
+    ros2_environment,
+    running_middleware,
+    zenoh_router,
+    zenoh_variables,
+)
 
 from chainshaper import (
     load_application,
@@ -22,6 +35,7 @@ from chainshaper import (
     measure_latency,
     open_recording,
 )
+from chainshaper.linux.processes import descendants, list_processes
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.planning.overruns import cycles_until_output
 
@@ -300,12 +314,18 @@ def test_each_mode_has_the_slot_of_its_own_profile(
     assert values["recordings"][1]["count"] > 100
 
 
+@pytest.mark.parametrize("rmw", MIDDLEWARES)
 @pytest.mark.parametrize("publication", ["synchronous", "in-process"])
 def test_receivers_get_the_output_at_a_constant_time_behind_it(
-    run: Callable[..., Result], publication: str
+    attempt: Callable[..., Attempt], publication: str, rmw: str
 ) -> None:
     options = ("--chain", "/ticked../commands", "--duration", "20s", "--publication", publication)
-    _, folder = run(DRIVING, "shape", "delivered", *options, "--delivery", "2ms")
+    with running_middleware(rmw) as variables:
+        words = (DRIVING, "shape", "delivered", *options, "--delivery", "2ms")
+        done, folder = attempt(*words, **variables)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "process has died" not in done.stderr, "nor do our own nodes, as they end"
+    assert open_recording(folder / "after").info.rmw == rmw
     behind, unshaped = (
         measure_latency(folder / name)
         .analysis.traversals.drop_nulls("reception_ns")
@@ -317,6 +337,61 @@ def test_receivers_get_the_output_at_a_constant_time_behind_it(
     assert len(behind) > 100
     assert least >= 2 * MS - MS // 20, "the message is stamped as it is written"
     assert most - least < np.subtract(*np.quantile(unshaped, (0.9, 0.1))) / 2
+
+
+def test_zenohs_router_dies_and_comes_back_while_the_chain_is_shaped(
+    run: Callable[..., Result], tmp_path: Path
+) -> None:
+    """Nodes need it to meet only."""
+    require_packages("rmw_zenoh_cpp")
+    port, killed, back = free_port(), list[int](), list[int]()
+    folder = Path(os.environ.get("CHAINSHAPER_SHAPED", tmp_path)) / "router"
+
+    def connections() -> int:
+        """How many of them the router has."""
+        lines = Path("/proc/net/tcp").read_text().splitlines()[1:]
+        ends = (line.split()[1:4:2] for line in lines)
+        return sum(local.endswith(f":{port:04X}") and state == "01" for local, state in ends)
+
+    def gated() -> bool:
+        """Whether the chain is shaped, and has been for some cycles."""
+        processes = list_processes()
+        ours = descendants({one.pid: one.parent for one in processes}, os.getpid())
+        threads = (thread for one in processes if one.pid in ours for thread in one.threads)
+        return any(thread.comm.startswith("gate-") for thread in threads)
+
+    def interrupt() -> None:
+        with zenoh_router(port) as router:
+            wait_for(gated, "the gate", 300, 0.5)
+            time.sleep(12)  # until it is measured, and then some
+            assert connections() >= len(DRIVING)
+            killed.append(time.monotonic_ns())
+            router.kill()
+        wait_for(lambda: not connections(), "its connections to end")
+        time.sleep(3)
+        with zenoh_router(port):
+            wait_for(lambda: connections() >= len(DRIVING), "nodes that are connected again", 30)
+            back.append(time.monotonic_ns())
+            ended.wait()
+
+    options = ("--chain", "/ticked../commands", "--duration", "30s", "--publication", "in-process")
+    with ThreadPoolExecutor(1) as aside:
+        ended, interrupting = Event(), aside.submit(interrupt)
+        try:
+            run(DRIVING, "shape", "router", *options, **zenoh_variables(port))
+        finally:
+            ended.set()
+        interrupting.result()
+    found = measure_latency(folder / "after").analysis.traversals.sort("start")
+    before, gone, after = (
+        found.filter(pl.col("start").is_between(*span))
+        for span in ((0, killed[0] - 200 * MS), (killed[0], back[0]), (back[0] + 5000 * MS, 2**62))
+    )
+    assert before["complete"].all()
+    assert len(before) > 10
+    assert len(gone) > 20
+    assert gone["complete"].all()
+    assert len(after) > 20
 
 
 def _driving(attempt: Callable[..., Attempt], folder: Path, topic: str, duration: str) -> Attempt:

@@ -7,11 +7,18 @@ needs more names the packages: `@pytest.mark.ros2("rclcpp", "launch_ros")`.
 import functools
 import os
 import shutil
+import socket
 import subprocess
 import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
+
+MIDDLEWARES = ("rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_zenoh_cpp")
+"""The middlewares that chainshaper is run on: tests skip those that are not installed."""
 
 _WHEELS = Path(__file__).parents[2] / ".venv-ros/setup.sh"
 _LISTED_BY_LTTNG = """
@@ -48,6 +55,57 @@ def require_packages(*names: str) -> None:
         place = f"share/ament_index/resource_index/packages/{name}"
         if not any(Path(prefix, place).is_file() for prefix in prefixes):
             pytest.skip(f"the package {name} is not installed in this ROS 2")
+
+
+@contextmanager
+def running_middleware(rmw: str, zenoh: str = "") -> Iterator[dict[str, str]]:
+    """The variables that choose a middleware; Zenoh has its router as long as they are used.
+
+    ``zenoh`` is added to the configuration of Zenoh's nodes and router. A test is skipped where the
+    middleware is not installed.
+    """
+    require_packages(rmw)
+    if rmw != "rmw_zenoh_cpp":
+        yield {"RMW_IMPLEMENTATION": rmw}
+        return
+    port = free_port()
+    with zenoh_router(port, zenoh):
+        yield zenoh_variables(port, zenoh)
+
+
+def free_port() -> int:
+    """A port of this machine at which nothing is heard."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+def zenoh_variables(port: int, zenoh: str = "") -> dict[str, str]:
+    """The variables of nodes on Zenoh whose router hears them at a port."""
+    override = f'connect/endpoints=["tcp/127.0.0.1:{port}"]{zenoh}'
+    return {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp", "ZENOH_CONFIG_OVERRIDE": override}
+
+
+@contextmanager
+def zenoh_router(port: int, zenoh: str = "") -> Iterator["subprocess.Popen[bytes]"]:
+    """Zenoh's router, which hears nodes at a port of this machine."""
+    override = f'listen/endpoints=["tcp/127.0.0.1:{port}"]{zenoh}'
+    environment = {**ros2_environment(), "ZENOH_CONFIG_OVERRIDE": override}
+    folders = environment["AMENT_PREFIX_PATH"].split(os.pathsep)
+    programs = (Path(folder, "lib/rmw_zenoh_cpp/rmw_zenohd") for folder in folders)
+    program = next(filter(Path.is_file, programs))
+    with subprocess.Popen([program], env=environment, stdout=subprocess.DEVNULL) as router:
+        try:
+            while router.poll() is None:
+                with (
+                    suppress(ConnectionRefusedError),
+                    socket.create_connection(("127.0.0.1", port)),
+                ):
+                    break
+                time.sleep(0.05)
+            yield router
+        finally:
+            router.terminate()
 
 
 def require_lttng_of_ros2() -> None:

@@ -160,7 +160,7 @@ ZENOH = ("app-0", "net-0", "acc-0", "tx-0", "rx-0")
     [
         (CYCLONE, None),
         (("dds.udp.7410", "dds.shm.7411"), None),
-        (ZENOH, "zenoh"),
+        (ZENOH, None),
         ((*CYCLONE, "KeepAlive"), "iceoryx"),
         (("recv", "rCo00001##Evt"), "connext"),
         (("talker", "talker"), "unnamed"),

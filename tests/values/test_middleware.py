@@ -53,7 +53,7 @@ def test_limits_of_distributions_and_settings_are_known() -> None:
     iceoryx = {"CYCLONEDDS_URI": "<SharedMemory><Enable>true</Enable></SharedMemory>"}
     assert limit_by_settings(CYCLONE_DDS, "jazzy", iceoryx) == "iceoryx"
     assert limit_by_settings(CYCLONE_DDS, "jazzy", {}) is None
-    assert limit_by_settings(ZENOH, None, {}) == "zenoh"
+    assert limit_by_settings(ZENOH, None, {}) is None
     assert limit_by_thread("KeepAlive") == "iceoryx"
     assert middleware_of("rmw_of_tomorrow") is middleware_of(None) is None
     used = {middleware.limit for middleware in MIDDLEWARES} - {None}

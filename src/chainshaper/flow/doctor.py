@@ -11,12 +11,14 @@ from pathlib import Path
 
 from chainshaper.enforcement.back_ends import offered_back_ends
 from chainshaper.linux.child_processes import tool_environment
+from chainshaper.linux.processes import guessed_name, list_processes
 from chainshaper.linux.scheduling import available_cores, may_use_fifo, throttle_fraction
 from chainshaper.linux.threads import foreign_realtime_processes
 from chainshaper.values.errors import text_of
 from chainshaper.values.middleware import (
     DEFAULT_MIDDLEWARE,
     MIDDLEWARE_LIMITS,
+    Middleware,
     limit_by_settings,
     middleware_of,
 )
@@ -138,6 +140,21 @@ def _middleware() -> Iterator[Check]:
     purpose = "delivery threads, in their place beside a chain"
     remedy = "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp, or measure what `shape` makes of it"
     yield _check("middleware", purpose, good, "limited", limited, remedy)
+    if middleware is not None and middleware.routers:
+        yield _router(middleware)
+
+
+def _router(middleware: Middleware) -> Check:
+    """Check whether a router runs by which nodes on this middleware find each other."""
+    running = (
+        f"{name.removeprefix('/')} (process {process.pid})"
+        for process in list_processes()
+        if (name := guessed_name(process.command)) in middleware.routers
+    )
+    remedy = "unless nodes are configured to find each other otherwise: ros2 run rmw_zenoh_cpp "
+    remedy += "rmw_zenohd"
+    purpose, good = "nodes that find each other", next(running, None)
+    return _check("router", purpose, good, "limited", "none runs on this machine", remedy)
 
 
 def _check(  # noqa: PLR0917 - a check's columns

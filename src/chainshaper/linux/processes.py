@@ -36,7 +36,6 @@ from chainshaper.linux.threads import (
 from chainshaper.values.errors import InputError, text_of
 from chainshaper.values.middleware import (
     MIDDLEWARES,
-    ZENOH,
     Middleware,
     MiddlewareLimit,
     limit_by_thread,
@@ -282,12 +281,11 @@ def middleware_limit(process: RunningProcess) -> MiddlewareLimit | None:
     started = [thread for thread in process.threads if thread.tid != process.pid]
     if not process.participates or not started:
         return None
-    if any(map(is_of_zenoh, started)):
-        return ZENOH.limit
     for thread in started:
         if (limit := limit_by_thread(thread.comm)) is not None:
             return limit
-    return None if any(thread_work(thread.comm) is not None for thread in started) else "unnamed"
+    named = (one for one in started if thread_work(one.comm) is not None or is_of_zenoh(one))
+    return None if any(named) else "unnamed"
 
 
 def takes_ros_arguments(command: Sequence[str]) -> bool:

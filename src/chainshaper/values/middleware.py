@@ -30,12 +30,11 @@ ThreadWork: TypeAlias = Literal[
 ]
 """What a thread of a middleware does."""
 
-MiddlewareLimit: TypeAlias = Literal["zenoh", "connext", "iceoryx", "unnamed"]
+MiddlewareLimit: TypeAlias = Literal["connext", "iceoryx", "unnamed"]
 """What is limited on a middleware: a key of :data:`MIDDLEWARE_LIMITS`."""
 
 _NEVER_RAN = "its threads are known by rules from its {}, and chainshaper never ran on it"
 MIDDLEWARE_LIMITS: dict[MiddlewareLimit, str] = {
-    "zenoh": f"Zenoh: {_NEVER_RAN.format('sources')}",
     "connext": f"RTI Connext: {_NEVER_RAN.format('manual')}",
     "iceoryx": f"Cyclone DDS with iceoryx: {_NEVER_RAN.format('sources')}; the thread that"
     " delivers has no name, and stays as it is",
@@ -85,7 +84,8 @@ class Middleware:
     * ``nameless_distributions``: ROS 2 distributions in which its threads have no names.
     * ``limiting_threads``: pattern of a thread's whole name → what is limited with it.
     * ``limiting_settings``: variable → pattern in its value, and what is limited with it.
-    * ``is_synchronous``: whether the thread that publishes always sends.
+    * ``has_publisher_threads``: whether a thread may publish for a publisher, and for nothing else
+      than publishers, so that a slot could hold it.
     * ``undelivered_bytes``: distributions in which ``rmw`` does not deliver messages with a field
       ``uint8[]`` to who takes them serialized.
     """
@@ -105,7 +105,7 @@ class Middleware:
     nameless_distributions: tuple[str, ...] = ()
     limiting_threads: tuple[tuple[str, MiddlewareLimit], ...] = ()
     limiting_settings: tuple[tuple[str, str, MiddlewareLimit], ...] = ()
-    is_synchronous: bool = False
+    has_publisher_threads: bool = True
     undelivered_bytes: tuple[str, ...] = ()
 
 
@@ -136,7 +136,7 @@ CYCLONE_DDS = Middleware(
     # iceoryx, by a thread of its `posh_runtime_impl.cpp`; its `Listener` names no thread.
     limiting_threads=(("KeepAlive", "iceoryx"),),
     limiting_settings=(("CYCLONEDDS_URI", r"iox|<SharedMemory>", "iceoryx"),),
-    is_synchronous=True,
+    has_publisher_threads=False,  # the thread that publishes sends
 )
 
 FAST_DDS = Middleware(
@@ -191,7 +191,7 @@ ZENOH = Middleware(
     fewest_runtimes=3,  # the variable ZENOH_RUNTIME may join two of the five to others
     nameless_libraries=("rmw_zenoh_cpp",),
     routers=("/rmw_zenohd", "/zenohd"),
-    limit="zenoh",
+    has_publisher_threads=False,  # `tx` sends for all topics, and what keeps links alive
 )
 
 GURUM_DDS = Middleware(

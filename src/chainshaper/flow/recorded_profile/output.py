@@ -138,7 +138,7 @@ def _is_asynchronous(recording: Recording, node: str) -> bool | None:
     if any(thread_work(thread.comm) is not None for thread in of_process):
         return any(thread.role == "publisher" for thread in of_process)
     middleware = middleware_of(recording.info.rmw)
-    if middleware is not None and middleware.is_synchronous:
+    if middleware is not None and not middleware.has_publisher_threads:
         return False
     return None
 
