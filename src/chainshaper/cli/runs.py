@@ -120,7 +120,9 @@ def _show_demonstration(shown: "Demonstration", *, verbose: bool) -> None:
         if len(shown.shaped) > 1:
             out.show_line(f"{'' if number == 0 else chr(10)}  ROS 2 nodes, {title}")
         out.show(*comparison_lines(comparison))
-    if shown.longer:
+    if shown.retried:
+        out.show_line("  ! No plan fitted the first cycles: it measured for longer.")
+    elif shown.longer:
         out.show_line("  ! Stalls hit more than a third of the cycles: it measured for longer.")
     if shown.percentile is not None:
         most = f"{shown.percentile:g} % of the cycles"

@@ -42,7 +42,8 @@ class Demonstration:
     * ``before``: the application as it is, measured over all its turns.
     * ``comparison``: of ``before`` and of each way of shaping; None: nothing could be planned.
     * ``unplanned``: why nothing could be planned; None: it could.
-    * ``longer``: whether it went on for longer, since the machine stood still too often.
+    * ``longer``: whether it went on for longer, since the machine stood still too often, or was
+      ``retried``: no plan fitted what was measured first.
     * ``shaped``: by the titles of the ways of shaping, each beside ``before`` alone.
     * ``plans``: of the ways.
     * ``percentile``: of the latencies without a plan, up to which was planned, since longer ones do
@@ -57,6 +58,7 @@ class Demonstration:
     shaped: Mapping[str, Comparison] = field(default_factory=dict)
     plans: tuple[Plan, ...] = ()
     percentile: float | None = None
+    retried: bool = False
 
 
 def synthetic_chain() -> Path:
@@ -195,7 +197,7 @@ class _Turns:
 
 def _demonstrated(turns: _Turns, folder: Path) -> Demonstration:
     """Measure and plan; then measure in turns, for longer where the machine stands still often."""
-    half, longer = max(1, turns.cycles // 2), False
+    half, retried = max(1, turns.cycles // 2), False
     turns.as_it_is(turns.cycles)
     plans, percentile = _plans_of_most(turns)
     if isinstance(plans, ChainshaperError):
@@ -203,21 +205,20 @@ def _demonstrated(turns: _Turns, folder: Path) -> Demonstration:
         if isinstance(usual, ChainshaperError) and not _at_the_mercy_of_others(turns.before):
             join_runs(turns.before, folder / "before")
             raise plans
-        longer = True
+        retried = True
         turns.as_it_is(turns.cycles)
         plans, percentile = _plans_of_most(turns)
     if isinstance(plans, ChainshaperError):
         before = join_runs(turns.before, folder / "before")
         reason = str(plans).partition(". What helps: ")[0]  # options of `plan`, which are not here
-        return Demonstration(folder, measure_latency(before), None, reason, longer)
+        return Demonstration(folder, measure_latency(before), None, reason, True, retried=True)
     for way, plan in zip(turns.ways, plans, strict=True):
         save_plan(plan, folder / way.plan)
         turns.planned(plan)
     turns.shaped(plans, half)
     turns.as_it_is(half)
     turns.shaped(plans, turns.cycles - half)
-    if any(_often_disturbed(runs) for _, runs in turns.recorded()):
-        longer = True
+    if longer := any(_often_disturbed(runs) for _, runs in turns.recorded()):
         turns.as_it_is(half)
         turns.shaped(plans, turns.cycles)
     turns.progress(0.5, "comparing")
@@ -235,10 +236,11 @@ def _demonstrated(turns: _Turns, folder: Path) -> Demonstration:
         folder,
         unshaped,
         comparison,
-        longer=longer,
+        longer=longer or retried,
         shaped=shaped,
         plans=tuple(plans),
         percentile=percentile,
+        retried=retried,
     )
 
 
