@@ -82,11 +82,13 @@ def test_a_few_cycles_that_no_plan_fits_are_no_error(
     answered: bool,
 ) -> None:
     """One cycle in a hundred is left out, and it is said; of more nothing can be said."""
+    application = cs.load_application(application_file)
+    fits = cs.plan_recording(cs.simulate(application, tmp_path / "simulated", cycles=40))
 
-    def refuse_all(recording: Recording, request: PlanRequest) -> cs.Plan:
+    def refuse_all(_: Recording, request: PlanRequest) -> cs.Plan:
         if (request.percentile or 100) > fitting:
             raise InputError("they do not fit. What helps: --skip 2s")
-        return cs.plan_recording(recording, request=request)
+        return fits
 
     monkeypatch.setattr(demonstration, "plan_recording", refuse_all)
     monkeypatch.setattr(demonstration, "_often_disturbed", lambda _: False)
