@@ -233,6 +233,16 @@ def test_the_site_builds_without_warnings(tmp_path: Path) -> None:
     assert verbs == " ".join(GROUPS.values()).split()
 
 
+@pytest.mark.parametrize("page", ["index", "command_line"])
+def test_what_lists_the_verbs_lists_them_all_in_their_groups(page: str) -> None:
+    text = (ROOT / f"docs/{page}.md").read_text()
+    for title, verbs in GROUPS.items():
+        _, begin, rest = text.partition(f"\n| {title.lower()} |")
+        group = re.split(r"\n(?!\| \|)", rest)[0]  # rows without a first cell go on with it
+        assert begin, title
+        assert re.findall(r"\]\(verbs/(\w+)\.md\)", group) == verbs.split()
+
+
 def test_links_between_pages_lead_somewhere() -> None:
     for page in [*PAGES, ROOT / "CONTRIBUTING.md"]:
         for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text()):

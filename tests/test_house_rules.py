@@ -15,6 +15,7 @@ MOST_PARAMETERS, MOST_LINES = 12, 60
 
 ALLOWED_PARAMETERS = {
     "cli/plans.py: plan": "a verb: its parameters are the options of the command line",
+    "cli/runs.py: profile": "a verb: its parameters are the options of the command line",
     "cli/runs.py: shape": "a verb: its parameters are the options of the command line",
     "cli/runs.py: watch": "a verb: its parameters are the options of the command line",
     "flow/apply.py: apply_plan": "the public call of a verb: each is an option of `apply`",

@@ -110,6 +110,20 @@ def test_catkin_pkg_reads_the_manifest_without_a_warning() -> None:
     assert (warnings, manifest.get_build_type()) == ([], "cmake")
 
 
+def test_bloom_finds_the_changes_of_this_version() -> None:
+    """As REP 132 wants them: it reads lists below a version, and no sections in it."""
+    changelogs = pytest.importorskip("catkin_pkg.changelog", reason="catkin_pkg is not installed")
+    text = (ROOT / "CHANGELOG.rst").read_text().replace("(unreleased)", "(2026-11-28)")
+    read = changelogs.populate_changelog_from_rst(changelogs.Changelog("chainshaper"), text)
+    version, _, contents = next(iter(read.foreach_version()))
+    assert version == PROJECT["version"]
+    listed = "\n".join(map(str, contents))
+    for topic in ("Recording", "Planning", "Enforcement", "Installation"):
+        assert f"{topic}:" in listed
+    assert "``watch``" in listed
+    assert "Not stable" not in listed
+
+
 @pytest.mark.building
 @pytest.mark.timeout(900)
 def test_the_ros_package_is_built_by_cmake_and_brings_what_it_needs(tmp_path: Path) -> None:

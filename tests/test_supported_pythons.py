@@ -11,9 +11,16 @@ import sys
 from pathlib import Path
 
 import pytest
+from every_verb import COMMANDS, LIVE
+
+from chainshaper.cli.app import VERBS
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.building
+
+
+def test_no_verb_is_left_out() -> None:
+    assert set(VERBS) <= {command.split()[0] for _, command in COMMANDS + LIVE}
 
 
 @pytest.mark.timeout(1800)

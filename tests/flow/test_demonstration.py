@@ -8,7 +8,7 @@ import pytest
 import chainshaper as cs
 from chainshaper.flow import demonstration
 from chainshaper.flow.demonstration import run_demo
-from chainshaper.planning import ChainPlan, Plan
+from chainshaper.planning import ChainPlan, Plan, PlanRequest
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording, join_runs
 from chainshaper.verify.promises import outputs_due
@@ -65,12 +65,41 @@ def test_a_machine_too_busy_to_plan_for_gets_a_second_chance_and_then_an_answer(
     assert shown.comparison is None
     assert shown.unplanned == "the latencies do not fit into the cycle"
     assert shown.longer
-    first, both = planned_from
+    first, *_, both = planned_from
     assert both > 1.5 * first
     monkeypatch.setattr(demonstration, "_at_the_mercy_of_others", lambda _: False)
     with pytest.raises(InputError, match="do not fit"):
         run_demo(tmp_path / "calm", application=application_file, cycles=20)
     assert cs.measure_latency(tmp_path / "calm" / "before").analysis.statistics.count >= 15
+
+
+@pytest.mark.parametrize(("fitting", "answered"), [(99, True), (90, False)])
+def test_a_few_cycles_that_no_plan_fits_are_no_error(
+    application_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    fitting: float,
+    answered: bool,
+) -> None:
+    """One cycle in a hundred is left out, and it is said; of more nothing can be said."""
+    application = cs.load_application(application_file)
+    fits = cs.plan_recording(cs.simulate(application, tmp_path / "simulated", cycles=40))
+
+    def refuse_all(_: Recording, request: PlanRequest) -> cs.Plan:
+        if (request.percentile or 100) > fitting:
+            raise InputError("they do not fit. What helps: --skip 2s")
+        return fits
+
+    monkeypatch.setattr(demonstration, "plan_recording", refuse_all)
+    monkeypatch.setattr(demonstration, "_often_disturbed", lambda _: False)
+    shown = run_demo(tmp_path / "busy", application=application_file, cycles=20)
+    if answered:
+        assert shown.percentile == 99
+        assert shown.comparison is not None
+        assert (shown.unplanned, shown.longer) == (None, False)
+    else:
+        assert (shown.comparison, shown.percentile) == (None, None)
+        assert (shown.unplanned, shown.longer) == ("they do not fit", True)
 
 
 def test_runs_are_joined_and_what_was_due_between_them_is_not(

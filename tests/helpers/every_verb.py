@@ -17,6 +17,12 @@ from cores import cores
 
 CYCLES = "40"
 CHAIN = "/t1../t5"
+PLANT = """format: 1
+plant: {transfer_function: {numerator: [1], denominator: [1, 0, -9]}}
+noise: {process: 1, measurement: 0.000001}
+cost: {output: 1000, input: 0.001}
+controller: {design: lqg, delay: 50ms}
+"""
 COMMANDS = (
     (0, "--version"),
     (0, "--help"),
@@ -33,6 +39,7 @@ COMMANDS = (
     (0, "plan before --bands 2 -o bands.yaml"),
     (0, f"simulate app.yaml plan.yaml --cycles {CYCLES} -o after"),
     (0, "compare before after"),
+    (3, "control plant.yaml before"),  # it needs an extra
     (0, "report before after -o page.html"),
     (0, "export --perfetto after -o after.pftrace"),
     (0, "budget before -o budget.yaml"),
@@ -67,6 +74,7 @@ def main() -> int:
     """Run the commands in the folder that is named; the exit code."""
     folder, failed = Path(sys.argv[1]), 0
     folder.mkdir(parents=True)
+    (folder / "plant.yaml").write_text(PLANT)
     environment = dict(os.environ, PYTHONDONTWRITEBYTECODE="1")
     if os.environ.get("WITHOUT_COMPILERS"):
         environment["PATH"] = str(_programs_but_compilers(folder))

@@ -299,7 +299,7 @@ def test_only_a_single_path_that_was_recorded_is_cut() -> None:
     with pytest.raises(InputError, match="plan from a recording"):
         plan_chain(Profile(np.array([80, 90]) * MS, 100 * MS), request)
     beside = [CallbackTimes(node, 1, 1, 1, 1) for node in ("/n1", "/rear", "/n2")]
-    with pytest.raises(InputError, match="waits for /rear beside it, and what these took is not"):
+    with pytest.raises(InputError, match="joins data of /rear, whose times are not known"):
         plan_chain(profile([[80, 80]], callbacks=tuple(beside)), request)
 
 

@@ -94,7 +94,7 @@ def demo(
     else:
         values = comparison_json(shown.comparison) | {"folder": str(folder)}
     if json:
-        out.print_json(values | {"longer": shown.longer})
+        out.print_json(values | {"longer": shown.longer, "percentile": shown.percentile})
         return
     _show_demonstration(shown, verbose=verbose)
 
@@ -120,8 +120,13 @@ def _show_demonstration(shown: "Demonstration", *, verbose: bool) -> None:
         if len(shown.shaped) > 1:
             out.show_line(f"{'' if number == 0 else chr(10)}  ROS 2 nodes, {title}")
         out.show(*comparison_lines(comparison))
-    if shown.longer:
+    if shown.retried:
+        out.show_line("  ! No plan fitted the first cycles: it measured for longer.")
+    elif shown.longer:
         out.show_line("  ! Stalls hit more than a third of the cycles: it measured for longer.")
+    if shown.percentile is not None:
+        most = f"{shown.percentile:g} % of the cycles"
+        out.show_line(f"  ! Planned for {most}: the longest ones do not fit into a period.")
     out.show_line("")
     earlier = sorted(Path().glob("chainshaper-demo-2*/comparison.json"))[-1:]
     if len(shown.shaped) > 1 and earlier:

@@ -21,7 +21,7 @@ from chainshaper.reporting.page import write_report
 from chainshaper.values.errors import ChainshaperError, OperationError
 from chainshaper.values.files import folder_beside, write_whole
 from chainshaper.values.progress import Progress
-from chainshaper.values.recording import Recording, join_runs, refuse_existing
+from chainshaper.values.recording import Recording, join_runs, open_recording, refuse_existing
 from chainshaper.verify.measure import Comparison, Measurement, compare_recordings, measure_latency
 from chainshaper.workload.description import Application, load_application
 from chainshaper.workload.live import run_application
@@ -30,6 +30,9 @@ BEFORE = "measure as it is"
 _STANDARD = PlanRequest()
 _MOST_DISTURBED = 1 / 3
 """Share of cycles; where stalls of the machine hit more, the demonstration goes on."""
+_MOST, _USUAL = 99.0, 50.0
+"""Percentiles of the latencies: a few longer ones are not planned for where they fit into no cycle;
+where not even half fit, the application is why, and no machine."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +42,12 @@ class Demonstration:
     * ``before``: the application as it is, measured over all its turns.
     * ``comparison``: of ``before`` and of each way of shaping; None: nothing could be planned.
     * ``unplanned``: why nothing could be planned; None: it could.
-    * ``longer``: whether it went on for longer, since the machine stood still too often.
+    * ``longer``: whether it went on for longer, since the machine stood still too often, or was
+      ``retried``: no plan fitted what was measured first.
     * ``shaped``: by the titles of the ways of shaping, each beside ``before`` alone.
     * ``plans``: of the ways.
+    * ``percentile``: of the latencies without a plan, up to which was planned, since longer ones do
+      not fit into a period; None: they do.
     """
 
     folder: Path
@@ -51,6 +57,8 @@ class Demonstration:
     longer: bool = False
     shaped: Mapping[str, Comparison] = field(default_factory=dict)
     plans: tuple[Plan, ...] = ()
+    percentile: float | None = None
+    retried: bool = False
 
 
 def synthetic_chain() -> Path:
@@ -189,27 +197,28 @@ class _Turns:
 
 def _demonstrated(turns: _Turns, folder: Path) -> Demonstration:
     """Measure and plan; then measure in turns, for longer where the machine stands still often."""
-    half, longer = max(1, turns.cycles // 2), False
+    half, retried = max(1, turns.cycles // 2), False
     turns.as_it_is(turns.cycles)
-    plans = _plans(turns)
+    plans, percentile = _plans_of_most(turns)
     if isinstance(plans, ChainshaperError):
-        if not _at_the_mercy_of_others(turns.before):
+        usual = _plans(turns, _USUAL)
+        if isinstance(usual, ChainshaperError) and not _at_the_mercy_of_others(turns.before):
             join_runs(turns.before, folder / "before")
             raise plans
-        longer = True
+        retried = True
         turns.as_it_is(turns.cycles)
-        plans = _plans(turns)
+        plans, percentile = _plans_of_most(turns)
     if isinstance(plans, ChainshaperError):
         before = join_runs(turns.before, folder / "before")
-        return Demonstration(folder, measure_latency(before), None, str(plans), longer)
+        reason = str(plans).partition(". What helps: ")[0]  # options of `plan`, which are not here
+        return Demonstration(folder, measure_latency(before), None, reason, True, retried=True)
     for way, plan in zip(turns.ways, plans, strict=True):
         save_plan(plan, folder / way.plan)
         turns.planned(plan)
     turns.shaped(plans, half)
     turns.as_it_is(half)
     turns.shaped(plans, turns.cycles - half)
-    if any(_often_disturbed(runs) for _, runs in turns.recorded()):
-        longer = True
+    if longer := any(_often_disturbed(runs) for _, runs in turns.recorded()):
         turns.as_it_is(half)
         turns.shaped(plans, turns.cycles)
     turns.progress(0.5, "comparing")
@@ -224,19 +233,47 @@ def _demonstrated(turns: _Turns, folder: Path) -> Demonstration:
         for way, measurement in zip(turns.ways, after, strict=True)
     }
     return Demonstration(
-        folder, unshaped, comparison, longer=longer, shaped=shaped, plans=tuple(plans)
+        folder,
+        unshaped,
+        comparison,
+        longer=longer or retried,
+        shaped=shaped,
+        plans=tuple(plans),
+        percentile=percentile,
+        retried=retried,
     )
 
 
-def _plans(turns: _Turns) -> list[Plan] | ChainshaperError:
-    """Plan each way from what has been measured without a plan; return why it is not possible."""
+def _plans_of_most(turns: _Turns) -> tuple[list[Plan] | ChainshaperError, float | None]:
+    """Plan from all latencies without a plan; where these do not fit, from all but the longest few.
+
+    Return the percentile up to which, None: all. A machine that stood still for longer than a
+    period, or was slow to start the nodes, is in a few cycles, and no reason to shape nothing.
+    """
     turns.progress(0.0, "2/3 plan")
+    plans = _plans(turns)
+    if isinstance(plans, ChainshaperError):
+        of_most = _plans(turns, _MOST)
+        if not isinstance(of_most, ChainshaperError):
+            return of_most, _MOST
+    return plans, None
+
+
+def _plans(turns: _Turns, percentile: float | None = None) -> list[Plan] | ChainshaperError:
+    """Plan each way from what has been measured without a plan; return why it is not possible.
+
+    ``percentile``: of the latencies, up to which is planned; None: as the way says.
+    """
     if len(turns.before) == 1:
         recording = turns.before[0]
     else:
-        recording = join_runs(turns.before, turns.place / "planned_from")
+        joined = turns.place / f"planned_from_{len(turns.before)}"
+        recording = open_recording(joined) if joined.exists() else join_runs(turns.before, joined)
+    requests = [way.request for way in turns.ways]
+    if percentile is not None:
+        requests = [replace(request, percentile=percentile) for request in requests]
     try:
-        return [plan_recording(recording, request=way.request) for way in turns.ways]
+        return [plan_recording(recording, request=request) for request in requests]
     except ChainshaperError as error:
         return error
 

@@ -220,14 +220,15 @@ def _apart(profile: Profile) -> Profile:
     if not profile.graph_steps_ns.size:
         nodes = Counter(callback.node for callback in profile.callbacks)
         if beside := sorted(nodes - Counter(profile.nodes)):
-            reason = f"{name} waits for {', '.join(beside)} beside it, and what these took"
-            raise InputError(f"{reason} is not known: plan from a recording")
+            reason = f"{name} joins data of {', '.join(beside)}, whose times are not known"
+            raise InputError(f"{reason}: plan from a recording")
         return alone(profile)
     if UNKNOWN in profile.begins_ns:
         node = profile.callbacks[profile.begins_ns.index(UNKNOWN)].node
-        reason = f"{name} waits for what {node} begins, and how long after {profile.nodes[0]} that"
-        reason += " is varies in the recording, in which instances wait for each other: record its"
-        raise InputError(f"{reason} nodes on more cores (`chainshaper profile --policy pipelined`)")
+        reason = f"{name} joins data of {node}, which starts at varying times after"
+        reason += f" {profile.nodes[0]} in the recording, where instances wait for each other"
+        remedy = "record its nodes on more cores (`chainshaper profile --policy pipelined`)"
+        raise InputError(f"{reason}: {remedy}")
     return replace(
         profile,
         latencies_ns=_work(profile, profile.graph_steps_ns).finished_ns[:, -1],
