@@ -119,7 +119,7 @@ def test_python_dash_m_imports_from_no_current_folder(tmp_path: Path) -> None:
 def copied(folder: Path) -> Path:
     """The package where nothing but PYTHONPATH leads to, as colcon installs it."""
     root = folder / "install"
-    values = ("__init__", "errors", "files", "leftovers", "middleware")
+    values = ("__init__", "durations", "errors", "files", "leftovers", "middleware")
     linux = ("__init__", "child_processes", "scheduling", "threads")
     package = ("__init__", "vendored_packages")
     for name in (*package, *(f"values/{v}" for v in values), *(f"linux/{one}" for one in linux)):

@@ -139,6 +139,7 @@ CALLBACK_GROUPS: Path | None = option(
     "--callback-groups FILE.yaml",
     "The configuration of callback_isolated_executor that was in force: class and cores of each"
     " callback group's thread. What the kernel showed while it ran counts before it.",
+    rich_help_panel="What no event shows",
 )
 SCHEDULER: str | None = option(
     "--scheduler ADDRESS",
