@@ -143,7 +143,7 @@ def test_without_the_privilege_it_runs_with_what_it_may(
         ("profile -o OUT", "no command given"),
         ("profile -o OUT --chain /a../b -- true", "Add --like REC"),
         ("shape APP -o OUT", "a described application has its plan"),
-        ("export REC -o OUT", "add one of --perfetto, --mcap"),
+        ("export REC -o OUT", "add --perfetto or --mcap"),
         ("release nothing", "no run 'nothing': "),
     ],
 )

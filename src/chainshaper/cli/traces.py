@@ -542,7 +542,7 @@ def export(
     """
     if [perfetto, mcap, callback_groups].count(True) != 1:
         reason = "the format is missing, or there are two"
-        raise InputError(f"{reason}: add one of --perfetto, --mcap and --callback-groups")
+        raise InputError(f"{reason}: add --perfetto or --mcap, or --callback-groups")
     if template is not None and not callback_groups:
         raise InputError("--template is for a plan's priorities: add --callback-groups")
     if callback_groups:

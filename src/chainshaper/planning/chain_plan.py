@@ -197,7 +197,9 @@ class Thread(Part):
     role: Literal["executor", "publisher"] = "executor"
     # The callbacks of the executor, by topic or as `every 100ms`; none: all executors of the node.
     # Behind the look at its callback group, values of a file are lists, as in Python: not strict.
-    callbacks: tuple[Annotated[str, AfterValidator(_callback)], ...] = Field((), strict=False)
+    callbacks: tuple[Annotated[str, AfterValidator(_callback)], ...] = Field(
+        default=(), strict=False
+    )
     # The executor's callback group as callback_isolated_executor names it, which says node and
     # callbacks as well (values/callback_groups.py).
     callback_group: str | None = None
