@@ -159,12 +159,9 @@ def data_flow(
     pieces = coroutines.coroutine_pieces(tables)
     instances = _with_coroutines(ends.instances, pieces, objects.callbacks)
     instances, taken = _with_assumed_readers(instances, taken, objects, tables)
-    taken = _consumed(taken, instances)
-    if "gate_release" in tables:
-        taken = _released(taken, instances, gate_decisions(tables, objects))
+    taken = _used(taken, instances, tables, objects)
     taken, unseen = with_unseen_takes(taken, instances, published, objects)
-    running = _running(instances, pieces, tables, objects)
-    published = _published_in(published, running, objects)
+    published = _published_in(published, _running(instances, pieces, tables, objects), objects)
     if "rcl_timer_call" not in tables and instances["assumed"].any():
         published = _begun_outside(published, instances)
     if sent.height and received.height:
@@ -465,6 +462,16 @@ def _with_assumed_readers(
     return all_instances.select(instances.columns), taken.with_columns(
         assumed_instance=instance_of_take
     )
+
+
+def _used(
+    taken: pl.DataFrame, instances: pl.DataFrame, tables: events.EventTables, objects: Objects
+) -> pl.DataFrame:
+    """Give messages the ``instance`` that used them, those that waited in a gate included."""
+    taken = _consumed(taken, instances)
+    if "gate_release" not in tables:
+        return taken
+    return _released(taken, instances, gate_decisions(tables, objects))
 
 
 def _consumed(taken: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
