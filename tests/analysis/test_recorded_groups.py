@@ -85,7 +85,7 @@ def test_a_process_that_announces_nothing_has_no_groups_that_are_known() -> None
 def test_actions_are_waitables_which_no_id_names() -> None:
     story = Story()
     node, parameters = _node(story)
-    story.service(node, "/work/_action/send_goal", callbackless=True)
+    story.service(node, "/tidy/_action/send_goal", callbackless=True)
     story.runs(parameters, 1, 2, reads=0, tid=10)
     story.runs(story.timer(node, 100_000_000), 3, 4, tid=11)
     assert all(known.certain for known in _groups(story))

@@ -270,8 +270,11 @@ def test_a_chain_through_processes_is_what_they_noted_on_each_middleware(
     assert recording.info.rmw == rmw
     assert check_traversals(recording, "/begun../done", tuple(STAGES), notes) > 100
     found = analyse_latency(recording, "/begun../done")
-    of_origin = {(one.callback, one.origin): one for one in noted(notes)}
-    began = {one.began: one.origin for one in noted(notes) if one.callback == "timer"}
+    instances = noted(notes)
+    of_origin = {(instance.callback, instance.origin): instance for instance in instances}
+    began = {
+        instance.began: instance.origin for instance in instances if instance.callback == "timer"
+    }
     instants = sorted(began)
     for row in found.traversals.filter("complete").iter_rows(named=True):
         origin = began[instants[bisect_left(instants, row["start"])]]

@@ -356,8 +356,10 @@ def test_zenohs_router_dies_and_comes_back_while_the_chain_is_shaped(
     def gated() -> bool:
         """Whether the chain is shaped, and has been for some cycles."""
         processes = list_processes()
-        ours = descendants({one.pid: one.parent for one in processes}, os.getpid())
-        threads = (thread for one in processes if one.pid in ours for thread in one.threads)
+        parents = {process.pid: process.parent for process in processes}
+        ours = descendants(parents, os.getpid())
+        of_ours = (process for process in processes if process.pid in ours)
+        threads = (thread for process in of_ours for thread in process.threads)
         return any(thread.comm.startswith("gate-") for thread in threads)
 
     def interrupt() -> None:

@@ -62,14 +62,18 @@ def nodes(variables: dict[str, str]) -> Iterator[list[int]]:
 
 def dds_threads(pid: int) -> dict[str, str | None]:
     """Name → kind of a process's threads of Zenoh, without their numbers."""
-    threads = (one.thread for one in find_threads(pid).threads)
-    return {one.comm.rpartition("-")[0] or one.comm: one.kind for one in threads if one.kind}
+    threads = (listed.thread for listed in find_threads(pid).threads)
+    return {
+        thread.comm.rpartition("-")[0] or thread.comm: thread.kind
+        for thread in threads
+        if thread.kind
+    }
 
 
 def test_threads_of_nodes_and_router_are_known_by_name() -> None:
     with running_middleware(RMW) as variables, nodes(variables) as pids:
         found = find_threads().threads
-        (router,) = {one.thread.pid for one in found if "/rmw_zenohd" in one.nodes}
+        (router,) = {listed.thread.pid for listed in found if "/rmw_zenohd" in listed.nodes}
         assert [dds_threads(pid) for pid in (*pids, router)] == [KINDS] * 3
         # Beside them: signals, timers, and LTTng's, named after the program.
         left = {one.thread.comm for one in found if one.thread.pid in pids and not one.thread.kind}

@@ -51,9 +51,7 @@ class Events:
 
     waits_s: NDArray[np.float64]
     slots: NDArray[np.int32]
-    under_way: (
-        int  # how many slots there are: outputs that may be on their way at a sample, and one
-    )
+    under_way: int  # so many slots: the outputs that may be on their way at a sample, and one
 
 
 def events_of(

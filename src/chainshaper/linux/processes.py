@@ -284,8 +284,10 @@ def middleware_limit(process: RunningProcess) -> MiddlewareLimit | None:
     for thread in started:
         if (limit := limit_by_thread(thread.comm)) is not None:
             return limit
-    named = (one for one in started if thread_work(one.comm) is not None or is_of_zenoh(one))
-    return None if any(named) else "unnamed"
+    is_named = any(
+        thread_work(thread.comm) is not None or is_of_zenoh(thread) for thread in started
+    )
+    return None if is_named else "unnamed"
 
 
 def takes_ros_arguments(command: Sequence[str]) -> bool:
